@@ -23,14 +23,15 @@ import torch
 from going_on import as_lesson, gone_on
 
 from poise.control import Compliance
-from poise.env.events import Pushes
-from poise.env.terms.phc_obs import style_terms
+from poise.env.observations import style_terms
+from poise.env.pushes import Pushes
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.learn import AmpConfig, Until
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.recipes.imitation import Imitation
 
 LEVEL = 0.16

@@ -23,7 +23,8 @@ import torch
 from paper_humanoid import body_points, count_jumps, paper_humanoid
 
 from poise.body import generate_table, make_humanoid
-from poise.kin import (
+from poise.formats import read_clip
+from poise.kinematics import (
     CORRECTIONS,
     IkBody,
     IkConfig,
@@ -34,8 +35,8 @@ from poise.kin import (
     ik_body,
     polish,
 )
-from poise.motion import Clip, read_clip
-from poise.spatial import quat_to_matrix
+from poise.motion import Clip
+from poise.motion.rotations import quat_to_matrix
 
 #: Frames of one sequence of the paper: 10 of the past and 30 that were synthesised.
 SEQUENCE = 40

@@ -10,7 +10,8 @@ from typing import Any
 
 import poise
 from poise.errors import PoiseError
-from poise.motion import Clip, describe, read_clip
+from poise.formats import read_clip
+from poise.motion import Clip, describe
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 #: Makes and reads one thing in a folder, by its name.

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from attack_case import WALK, case, command, info, read
 
-from poise.motion import Clip, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip
 
 
 def chain(joints: int, wide: bool = False) -> str:

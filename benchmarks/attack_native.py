@@ -7,7 +7,8 @@ from typing import Any
 
 from attack_case import WALK, case, read
 
-from poise.motion import Clip, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip
 
 
 @case("USD, 100,000 nested prims")

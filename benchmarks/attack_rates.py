@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from attack_case import WALK, case, info, read
 
-from poise.motion import read_clip, resample, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import resample
 
 PERSON = {
     "RHip": (-0.1, 0.9, 0), "LHip": (0.1, 0.9, 0), "RKnee": (-0.1, 0.5, 0.02), "LKnee": (0.1, 0.5, 0.02),

@@ -28,7 +28,7 @@ import poise.cli.inbetween
 import poise.cli.track
 import poise.jobs.runs
 from poise.errors import PoiseError
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 _TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path += [str(_TESTS), str(_TESTS / "jobs")]
@@ -100,12 +100,12 @@ _each("model", strange.MODEL, filled)
 @case("two trainings in one run folder")
 def _(folder: Path) -> Any:
     """The second one is refused while the first one holds the folder."""
-    from poise.learn.lock import only_writer
+    from poise.learn.checkpoint import only_writer
 
     run = folder / "run"
     shutil.copytree(OLD / "imitate", run)
     code = (
-        "from poise.learn.lock import only_writer\nfrom pathlib import Path\n"
+        "from poise.learn.checkpoint import only_writer\nfrom pathlib import Path\n"
         f"with only_writer(Path({str(run)!r})):\n print('held', flush=True)\n input()"
     )
     with subprocess.Popen(
@@ -146,7 +146,7 @@ def _(folder: Path) -> Any:
 @case("imitate into a folder with a dot")
 def _(folder: Path) -> Any:
     """Right: it is a folder. One iteration of the smallest training."""
-    from poise.cli.output import places
+    from poise.cli.options import places
 
     if places(folder / "run_v1.0") != (folder / "run_v1.0", None):
         raise RuntimeError("it was taken for a file")

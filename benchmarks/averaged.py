@@ -22,8 +22,8 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker, save_tracker
+from poise.learn.checkpoint import State
 from poise.learn.policy import Value
-from poise.learn.state import State
 
 
 def averaged(

@@ -23,12 +23,12 @@ from zero_help import CLIPS
 
 from poise.body import generate_table
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip
-from poise.motion.io import read_clip
 
 HEIGHTS_M = (1.16, 1.33, 1.5, 1.67, 1.83, 2.0)
 

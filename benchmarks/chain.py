@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import Tracked, track, write
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import mpjpe_global
-from poise.motion import Clip, read_clip, trim
-from poise.spatial import quat_mul
-from poise.spatial.directions import yaw_quat
+from poise.motion import Clip, trim
+from poise.motion.rotations import quat_mul, yaw_quat
 
 #: Files of each set, and words that are left out.
 SETS: dict[str, tuple[str, tuple[str, ...]]] = {

@@ -16,12 +16,13 @@ import numpy as np
 import torch
 
 from poise.body import BodyTable, find_anatomy, generate_table
-from poise.kin import Kinematics, clean_clip, clip_to_qpos, fit_humanoid, lowest_height
-from poise.kin.doctor.flips import out_of_reach
-from poise.kin.flight import find_flights
-from poise.kin.solids import centre_of_mass
-from poise.motion import Clip, read_clip, resample
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.formats import read_clip
+from poise.kinematics import Kinematics, clean_clip, clip_to_qpos, fit_humanoid, lowest_height
+from poise.kinematics.forward import centre_of_mass
+from poise.kinematics.rate import find_flights
+from poise.kinematics.repair.turns import out_of_reach
+from poise.motion import Clip, resample
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 
 RATE = 30.0
 BVH = (

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.formats import read_clip, write_clip
+from poise.formats.guess import ASF_UNIT_M
 from poise.motion import Clip, Skeleton
-from poise.motion.io import read_clip, write_clip
-from poise.motion.io.guess import ASF_UNIT_M
-from poise.spatial import rotvec_to_quat
+from poise.motion.rotations import rotvec_to_quat
 
 #: Rows of the 31 joints among the 38; the others are the ends of limbs.
 ENDS = (6, 12, 19, 26, 28, 35, 37)

@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from poise.formats import read_clip
 from poise.jobs.complete import complete
 from poise.jobs.inbetween.fill import inbetween, shipped_model
 from poise.jobs.open import open_run
-from poise.motion import read_clip, trim
+from poise.motion import trim
 
 #: Of subjects and sources that neither the network nor the policy has learned from, but for DeepMimic's.
 CLIPS = (

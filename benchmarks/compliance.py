@@ -31,21 +31,19 @@ from scipy.stats import spearmanr
 
 import poise
 from poise.control import Compliance, Stiffness
-from poise.env.events import Pushes
+from poise.env.pushes import Pushes
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.motion import read_clip
-from poise.papers.compliant.hopping import AT_SOMEBODY, WAYS, hopping
+from poise.papers.compliant.figures import Measured, measure, slope, throws
+from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
 from poise.papers.compliant.play import play
-from poise.papers.compliant.scene_meters import PUSHED_S
 from poise.papers.compliant.scenes import Balance, Chicken, Doorway, Hands, PlayScene, Throws, Trampoline
-from poise.papers.compliant.standing import standing
-from poise.papers.compliant.stiffness import Measured, measure
-from poise.papers.compliant.throw_figures import slope, throws
 from poise.papers.compliant.training import Learned, digest_of, shipped
+from poise.papers.compliant.watch import PUSHED_S
 from poise.plan import LookaheadConfig
+from poise.score.report import line_plot
 from poise.sim import SimConfig
-from poise.view import line_plot
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 

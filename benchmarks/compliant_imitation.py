@@ -24,11 +24,12 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.task import Acts
+from poise.formats import read_clip
 from poise.learn import LATEST, IterationStats, Until, load_policy, run
-from poise.motion import ClipLibrary, read_clip
+from poise.motion import ClipLibrary
+from poise.motion.rotations import into_heading
 from poise.papers.compliant.imitation_controller import CompliantImitation, build
 from poise.recipes.imitation import Imitation
-from poise.spatial import into_heading
 
 #: Worlds, and s, of an evaluation.
 WORLDS, SECONDS = 16, 20.0

@@ -29,11 +29,12 @@ from lookahead_sets import FILES, LIBRARIES, clips_of
 
 from poise import track
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.track import Tracked
 from poise.jobs.track.tracking import read_motion
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import jerk
-from poise.motion import Clip, read_clip, resample
+from poise.motion import Clip, resample
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import VIDEO, perturb_clip
 from poise.plan import LookaheadConfig

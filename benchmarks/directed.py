@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from poise.body import find_anatomy
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.direction import Direction
-from poise.kin.directed import Pin, TouchPoint
-from poise.motion import Clip, read_clip, trim
+from poise.kinematics.directed import Pin, TouchPoint
+from poise.motion import Clip, trim
 
 #: Walks, jumps, dances and everyday motion; six seconds of each at most.
 CLIPS = (

@@ -32,8 +32,7 @@ from tracker import HELD_OUT, SIXTY, TWINS
 
 from poise.body import BodyConfig
 from poise.jobs.endless.dreaming import dream
-from poise.jobs.endless.figures import Figures
-from poise.jobs.endless.frames import PIECE
+from poise.jobs.endless.dreamt import PIECE, Figures
 from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.folder import library_of, split

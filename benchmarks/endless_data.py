@@ -13,7 +13,8 @@ from torch import Tensor
 from tracker import SIXTY, TWINS
 
 from poise.body import BodyConfig
-from poise.jobs.endless.training import Motions, reach_of, spread
+from poise.jobs.endless.model import Motions, spread
+from poise.jobs.endless.training import reach_of
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import subject_of
 from poise.jobs.library.folder import library_of
@@ -21,7 +22,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.cvae import Frames
-from poise.synth.place_free import features_of
+from poise.synthesis.generator import features_of
 
 #: Frames of a past and of its future, 1 s and 2 s.
 PAST, FUTURE = 30, 60

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.kin.fk import Kinematics
-from poise.spatial import heading_quat, quat_conj, quat_rotate
-from poise.synth.generator import Kinematic
+from poise.kinematics.forward import Kinematics
+from poise.motion.rotations import heading_quat, quat_conj, quat_rotate
+from poise.synthesis.generator import Kinematic
 
 #: s between the moments that are compared, and length of what is compared, s.
 EVERY_S, LONG_S = 0.5, 2.0

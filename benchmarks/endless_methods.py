@@ -14,21 +14,19 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env import Acts, EnvStep, ImitationEnv, Reference
-from poise.env.goals.generator import MotionGenerator
-from poise.eval import Nothing
-from poise.jobs.endless.training import Motions, codes_of
+from poise.env.generator import MotionGenerator
+from poise.jobs.endless.model import Motions
+from poise.jobs.endless.training import codes_of
 from poise.jobs.tracker import Tracker
-from poise.kin import qpos_velocity
-from poise.learn.cvae import CVAEObjective, CVAETraining
+from poise.kinematics import qpos_velocity
+from poise.learn.cvae import CVAEConfig, CVAEObjective, CVAETraining, make_cvae
 from poise.learn.inbetween import InbetweenTrainer
 from poise.motion import ClipLibrary
-from poise.nets.cosine_cvae import make_cvae
-from poise.nets.cvae import CVAEConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task as universal_task
 from poise.recipes.residual_force import ResidualForce, task
-from poise.synth.generator import Kinematic
-from poise.synth.place_free import ROOT
+from poise.score import Nothing
+from poise.synthesis.generator import ROOT, Kinematic
 
 #: Width of all networks of motion, windows of a step of a network of the next frame and of ours.
 WIDTH, BATCH, OUR_BATCH = 128, 32, 64

@@ -43,7 +43,7 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.kin.fit import widen
+from poise.kinematics.fit import widen
 
 #: Of methods that draw; others make one future.
 SAMPLES = 10

@@ -15,9 +15,8 @@ from pathlib import Path
 import torch
 from tracker import HELD_OUT, SIXTY, TWINS
 
-from poise.jobs.endless.labels import read_labels
-from poise.jobs.endless.run import begin
-from poise.jobs.endless.training import Endless, train_generator
+from poise.jobs.endless.model import read_labels
+from poise.jobs.endless.training import Endless, begin, train_generator
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.learn.inbetween import BlockStats

@@ -11,15 +11,14 @@ import numpy as np
 import torch
 
 from poise.env import ImitationEnv
-from poise.env.goals import EndlessGoal
-from poise.env.goals.led import FALLS, TRACKS
-from poise.env.goals.steering import Steering
-from poise.eval import simulate
+from poise.env.generator import EndlessGoal, Steering
+from poise.env.led import FALLS, TRACKS
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
+from poise.score import simulate
 from poise.sim.guard import UnstableError
-from poise.synth.generator import Kinematic
+from poise.synthesis.generator import Kinematic
 
 #: Frames between two looks at how far it is; s for which what is down in the end is waited for.
 LOOK, AFTER_S = 900, 15.0

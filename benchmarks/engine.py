@@ -144,7 +144,7 @@ def _show_change(before: Result, now: Result) -> None:
 
 def _imitation(options: Options) -> Imitation:
     import poise
-    from poise.motion.io import read_clip
+    from poise.formats import read_clip
     from poise.recipes import ResidualForce, build
 
     path = options.clip or Path(poise.__file__).parent / "data" / "walk.bvh"

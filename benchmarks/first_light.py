@@ -17,12 +17,12 @@ from pathlib import Path
 
 import torch
 
+from poise.formats import read_clip
 from poise.jobs.deliver import deliver
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.learn import Until
 from poise.motion import ClipLibrary
-from poise.motion.io import read_clip
 from poise.recipes.residual_force import ResidualForce
 
 CLIPS = {

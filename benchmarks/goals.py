@@ -23,9 +23,13 @@ from torch import Tensor
 
 import poise
 from poise.env import ImitationEnv
-from poise.env.goals import ClipGoal, DisplacedGoal, GeneratorGoal, Goal, LedGoal, StreamGoal
-from poise.env.make import goal_of
+from poise.env.generator import GeneratorGoal
+from poise.env.goal import ClipGoal, Goal
+from poise.env.led import LedGoal
 from poise.env.recovery.clips import RecoveryClips
+from poise.env.stream import StreamGoal
+from poise.env.task import goal_of
+from poise.env.yielding import DisplacedGoal
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from poise.sim import make_backend

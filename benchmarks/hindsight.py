@@ -25,15 +25,16 @@ from going_on import as_lesson, gone_on
 
 import poise
 from poise.control import Stiffness
-from poise.env.events import Pushes
+from poise.env.pushes import Pushes
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.learn import Until
-from poise.motion import Clip, read_clip
-from poise.papers.compliant.standing import standing
-from poise.papers.compliant.stiffness import measure
+from poise.motion import Clip
+from poise.papers.compliant.figures import measure
+from poise.papers.compliant.motions import standing
 from poise.recipes.imitation import Imitation
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"

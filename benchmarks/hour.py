@@ -29,7 +29,7 @@ from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, track
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip, shifted
-from poise.motion.mirror import mirrored_clip
+from poise.motion.windows import mirrored_clip
 
 
 def in_a_row(

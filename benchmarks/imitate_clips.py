@@ -25,11 +25,11 @@ from speed import machine
 from zero_help import CLIPS
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.imitate import imitate
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.tracker import SHIPPED
 from poise.learn.checkpoint import write_atomic
-from poise.motion.io import read_clip
 
 #: File, skeleton and rate of each clip; `zero_help.py` has the same, but for the backflip.
 FILES = {k: v[:3] for k, v in CLIPS.items()}

@@ -29,13 +29,14 @@ import torch
 
 from poise.body import generate_table
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.track import track
-from poise.kin import examine
-from poise.kin.feet.contact import soles_of
-from poise.kin.loops import overlap_of, repeated
-from poise.kin.travel import Travel, find_travel, travelled
+from poise.kinematics import examine
+from poise.kinematics.feet import soles_of
+from poise.kinematics.loops import overlap_of, repeated
+from poise.kinematics.travel import Travel, find_travel, travelled
 from poise.metrics import jerk
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 COLUMNS = ("subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command")
 #: Takes that travel, and words of those that do not.

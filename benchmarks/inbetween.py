@@ -5,7 +5,7 @@
 
 Rows: zero-velocity, interpolation, RTN, RTN + TTA, transformer, transformer + TTA, at 5, 15, 30 and 45
 frames: L2P, L2Q, NPSS, FP, FQ, JQ, SM, with the recorded motion's own row. `--name Bandai` holds styles
-out as `eval.inbetween.BANDAI` says, `--name takes` other takes of every style, LAFAN1 subject 5. Figures
+out as `score.gaps.BANDAI` says, `--name takes` other takes of every style, LAFAN1 subject 5. Figures
 are of the final part (the default) or, for development, of `--part validation`. How the adaptation is
 set is chosen on validation alone. Everything is resumable: trainings go on, finished networks are read
 back, and runs that FILE.json holds figures of from the same training are not scored again (their cost is
@@ -28,7 +28,12 @@ import torch
 from inbetween_baselines import Baseline
 
 from poise.errors import PoiseError
-from poise.eval.inbetween import (
+from poise.jobs.inbetween.training import Inbetween, Task, begin, train
+from poise.learn.between import BetweenConfig
+from poise.learn.inbetween import MODEL, Adaptation, BlockStats, InbetweenModel, adapt, load_model
+from poise.learn.transition import Filled, Known
+from poise.metrics import physics
+from poise.score.gaps import (
     BANDAI,
     BANDAI_TAKES,
     LAFAN1,
@@ -41,13 +46,6 @@ from poise.eval.inbetween import (
     slide,
     test_set,
 )
-from poise.jobs.inbetween.training import Inbetween, Task, begin, train
-from poise.learn.adapt import Adaptation, adapt
-from poise.learn.inbetween import BlockStats
-from poise.learn.model import MODEL, InbetweenModel, load_model
-from poise.metrics import physics
-from poise.nets.between import BetweenConfig
-from poise.nets.transition import Filled, Known
 
 Net = Literal["transformer", "rtn"]
 PROTOCOLS = {"Bandai": BANDAI, "takes": BANDAI_TAKES, "LAFAN1": LAFAN1}

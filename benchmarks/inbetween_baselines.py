@@ -1,6 +1,6 @@
 """The two baselines of the LAFAN1 benchmark: standing still, and interpolation.
 
-Both have the networks' interface (`nets.transition`), so that one evaluation serves all rows.
+Both have the networks' interface (`learn.transition`), so that one evaluation serves all rows.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.nets.transition import Filled, Known, Layout
-from poise.spatial import forward_kinematics
+from poise.learn.transition import Filled, Known, Layout
+from poise.motion.rotations import forward_kinematics
 
 #: Under this distance of the dot product from 1 the published slerp is a plain weighted sum.
 _LINEAR = 0.01
@@ -32,7 +32,7 @@ class Baseline:
         return []
 
     def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> Filled:
-        """`length` frames after the last known one; see `nets.transition.TransitionNet`."""
+        """`length` frames after the last known one; see `learn.transition.TransitionNet`."""
         a, qa = known.past_root[:, -1:], known.past_rot[:, -1:]
         if self.kind == "zero-velocity":
             root = a.expand(-1, length, -1)

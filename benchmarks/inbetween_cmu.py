@@ -24,15 +24,12 @@ import torch
 from inbetween import choose_iterations, cost, known_of, some_of, truth_rows
 from inbetween_baselines import Baseline
 
-from poise.eval.inbetween import Row, TestSet, evaluate, score, test_set
 from poise.jobs.inbetween.training import Inbetween, Task, begin, train
 from poise.jobs.library.clips import LibraryConfig
-from poise.learn.adapt import Adaptation, adapt
-from poise.learn.between import BetweenTraining
-from poise.learn.inbetween import BlockStats
-from poise.learn.model import InbetweenModel, load_model, save_model
-from poise.nets.between import BetweenConfig
-from poise.nets.transition import Filled
+from poise.learn.between import BetweenConfig, BetweenTraining
+from poise.learn.inbetween import Adaptation, BlockStats, InbetweenModel, adapt, load_model, save_model
+from poise.learn.transition import Filled
+from poise.score.gaps import Row, TestSet, evaluate, score, test_set
 
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, boxing and exercises of 14,
 #: walks of 38, 39 and 43. The figures are of these.

@@ -19,15 +19,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.formats import read_clip
 from poise.jobs.inbetween.fill import shipped_model
-from poise.learn.model import load_model
+from poise.learn.inbetween import load_model
 from poise.metrics.plausibility import foot_slide
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
+from poise.motion.rotations import quat_conj, quat_mul, quat_to_rotvec
 from poise.motion.windows import foot_joints
-from poise.spatial import quat_conj, quat_mul, quat_to_rotvec
-from poise.synth.gaps import Gap
-from poise.synth.inbetween import EACH_GAP, Filling, fill_keyframes, interpolated
-from poise.view.poses import PoseRow, pose_rows
+from poise.score.report.svg import PoseRow, pose_rows
+from poise.synthesis.filler import EACH_GAP, Filling, Gap, interpolated
+from poise.synthesis.inbetween import fill_keyframes
 
 
 def slides(clip: Clip, low: np.ndarray, ground: float) -> dict[str, float]:

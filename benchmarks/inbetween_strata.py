@@ -31,19 +31,18 @@ from inbetween import choose_iterations, known_of, some_of
 from inbetween_baselines import Baseline
 from inbetween_cmu import WAYS, config_of
 
-from poise.eval.inbetween import TestSet, evaluate, predict, score, test_set
 from poise.jobs.inbetween.fill import shipped_model
 from poise.jobs.inbetween.training import Task, begin
-from poise.kin.feet.contact import standing_labels
-from poise.learn.adapt import adapt
-from poise.learn.model import InbetweenModel, load_model
+from poise.kinematics.feet import standing_labels
+from poise.learn.inbetween import InbetweenModel, adapt, load_model
+from poise.learn.transition import Filled
 from poise.metrics import l2p
 from poise.motion import Clip, Skeleton
+from poise.motion.rotations import forward_kinematics, normalize
 from poise.motion.windows import FrameBank
-from poise.nets.transition import Filled
-from poise.spatial import forward_kinematics, normalize
-from poise.synth.gaps import Gap
-from poise.synth.inbetween import Filling, fill_keyframes, interpolated
+from poise.score.gaps import TestSet, evaluate, predict, score, test_set
+from poise.synthesis.filler import Filling, Gap, interpolated
+from poise.synthesis.inbetween import fill_keyframes
 
 PARTS = ("strata", "clips", "samples", "adaptation")
 #: L2P of interpolation at 30 frames on LAFAN1.

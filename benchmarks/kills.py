@@ -29,8 +29,9 @@ import torch
 
 import poise
 from poise.cli.main import main as command_line
+from poise.formats import read_clip, write_clip
 from poise.learn.checkpoint import load_checkpoint
-from poise.motion import Clip, read_clip, trim, write_clip
+from poise.motion import Clip, trim
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 #: Kills of one run at most.
@@ -46,7 +47,7 @@ def miniature(folder: Path) -> None:
     """Clips and settings of trainings that take seconds."""
     from poise.jobs.endless.training import Endless
     from poise.jobs.inbetween.training import Inbetween, small
-    from poise.nets.cvae import CVAEConfig
+    from poise.learn.cvae import CVAEConfig
     from poise.settings import to_toml
 
     clip = read_clip(WALK)
@@ -66,7 +67,7 @@ def tiny_perpetual() -> None:
     """The recipe with networks that are trained in no time, in this process alone."""
     from poise.learn import CloneConfig, PPOConfig
     from poise.recipes import perpetual
-    from poise.recipes.perpetual import Perpetual, RecoveryPlan
+    from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
 
     ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
     own: dict[str, Any] = {

@@ -25,10 +25,11 @@ import numpy as np
 import torch
 from speed import machine
 
+from poise.formats import read_clip, write_clip
 from poise.learn.checkpoint import write_atomic
-from poise.motion import Clip, read_clip, resample, write_clip
-from poise.spatial import quat_mul, slerp
-from poise.view.svg import line_plot
+from poise.motion import Clip, resample
+from poise.motion.rotations import quat_mul, slerp
+from poise.score.report.svg import line_plot
 
 RATE = 30.0
 #: Frames from one clip to the next, and how far the next may be turned by, rad.

@@ -31,12 +31,13 @@ import torch
 from live_client import Sent, watch
 from speed import machine
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.live.characters import FALLS, RETURNS
-from poise.live.config import LiveConfig
+from poise.live.commands import LiveConfig
 from poise.live.session import Live
-from poise.live.sources.file import Loop, packet_of
-from poise.motion import Clip, read_clip
+from poise.live.sources import Loop, packet_of
+from poise.motion import Clip
 
 
 def serve(*argv: str) -> tuple[subprocess.Popen[str], str]:

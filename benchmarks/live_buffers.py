@@ -20,16 +20,17 @@ import numpy as np
 import torch
 from speed import machine
 
+from poise.formats import read_clip
+from poise.formats.point_fit import fit_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.kin.retarget.keypoint_body import PointBody
-from poise.live.config import LiveConfig
+from poise.kinematics.retarget.keypoint_goal import PointBody
+from poise.live.commands import LiveConfig
 from poise.live.session import Live
 from poise.live.stream import Packet
 from poise.metrics import success_rule
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
-from poise.motion.points.fit import fit_clip
 from poise.sim import difference
 
 BUFFERS, NOISES = (0.0, 0.033, 0.1, 0.2, 0.4), (0.0, 0.25, 0.5, 1.0)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from websockets.asyncio.client import connect
 
-from poise.live.sources.file import Loop
+from poise.live.sources import Loop
 from poise.motion import Clip
 
 #: s that each person stands at first.

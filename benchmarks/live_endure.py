@@ -28,7 +28,7 @@ from speed import machine
 from live import clips_of, memory_mb, serve
 from poise.live.characters import FALLS, RETURNS
 from poise.motion import Clip
-from poise.view.svg import line_plot
+from poise.score.report.svg import line_plot
 
 #: s before figures count, s after the client's end in which characters that are down may still get up.
 WARMS_S, ENDS_S = 10.0, 20.0

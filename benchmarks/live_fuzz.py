@@ -24,14 +24,11 @@ from websockets.sync.client import connect
 
 from poise.errors import PoiseError
 from poise.live.commands import command, parse
-from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
-from poise.live.sinks.vmc import datagram
-from poise.live.sources.sockets import StreamDoor
-from poise.live.sources.stream import Frame, JsonStream
-from poise.live.sources.vmc import VmcSource
+from poise.live.sockets import Guard, StreamDoor
+from poise.live.sources import Frame, JsonStream
 from poise.live.stream import Inbox
-from poise.live.vrm import standard
+from poise.live.vmc import VmcSource, datagram, standard
 
 SKELETON = standard()
 #: What a whole message at each door is.

@@ -29,11 +29,11 @@ from speed import machine
 
 from live import serve
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.track import track
-from poise.kin import retarget
-from poise.live.sources.vmc import messages
-from poise.live.vrm import standard, t_pose, to_unity
-from poise.motion import Clip, read_clip, resample
+from poise.kinematics import retarget
+from poise.live.vmc import messages, standard, t_pose, to_unity
+from poise.motion import Clip, resample
 
 #: s that it stands before the motion, Hz of the messages.
 STANDS_S, RATE = 3.0, 30.0

@@ -18,13 +18,13 @@ from typing import Any
 from lengths import RATE, joined
 from speed import machine
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
-from poise.motion import read_clip
 
 #: s of a piece.
 PIECE_S = 20.0

@@ -18,16 +18,17 @@ from lookahead_sets import Condition, disturbed
 from torch import Tensor
 
 from poise.env import Acts
-from poise.eval import Nothing, Recorder, perturb, score_rollouts, simulate
-from poise.eval.rolloutset import RolloutSet, judge
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of, look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.metrics import foot_contacts, foot_points, mpjpe_global, mpjpe_root, success_rule
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.plan import Lookahead, LookaheadConfig
 from poise.recipes.imitation import Imitation
+from poise.score import Nothing, Recorder, perturb, score_rollouts, simulate
+from poise.score.rollouts import RolloutSet, judge
 from poise.sim import CpuBackend
 
 #: Pushes begin after a second and come every 2 s; each lasts 0.1 s. Control steps at 30 Hz.

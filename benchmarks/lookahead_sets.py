@@ -11,15 +11,15 @@ import torch
 from tracker import HELD_OUT, SIXTY
 
 from poise.errors import PoiseError
+from poise.formats.point_noise import smooth
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import matches, subject_of
 from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
 from poise.motion import Clip
 from poise.motion.noise import VIDEO, perturb_clip, scaled
-from poise.motion.points.clean import smooth
+from poise.motion.rotations import unwrap_quats
 from poise.plan import LookaheadConfig
-from poise.spatial import unwrap_quats
 
 #: Clips of sets in the folder of data: a pattern, and words that are left out.
 FILES: dict[str, tuple[str, tuple[str, ...]]] = {

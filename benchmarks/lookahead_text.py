@@ -34,7 +34,7 @@ from lookahead_figures import (
 from lookahead_sets import CONDITIONS
 
 from poise.learn.checkpoint import write_atomic
-from poise.view.svg import line_plot
+from poise.score.report.svg import line_plot
 
 MARK = "<!-- lookahead -->"
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.formats import write_clip
 from poise.jobs.deliver import simulated_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import evaluate, trained_policy
 from poise.motion import Clip, Skeleton, resample
-from poise.motion.io import write_clip
-from poise.spatial import quat_conj, quat_mul, quat_rotate_inv
+from poise.motion.rotations import quat_conj, quat_mul, quat_rotate_inv
 
 NAMES = {
     "root": "Hips",

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from poise.errors import PoiseError
 from poise.learn.cvae import Frames
 from poise.settings import validate
-from poise.synth.place_free import coordinates, past_features
+from poise.synthesis.generator import coordinates, past_features
 
 #: Least deviation of a number.
 _MIN_STD = 1e-2
@@ -191,7 +191,7 @@ class NextFrameObjective:
 
 
 class NextFrames:
-    """Makes the next segment of motion frame by frame (`env.goals.generator.MotionGenerator`).
+    """Makes the next segment of motion frame by frame (`env.generator.MotionGenerator`).
 
     Args:
         net: the trained network.

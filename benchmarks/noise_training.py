@@ -21,12 +21,12 @@ from typing import Any
 import torch
 from speed import machine
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.noise import robustness
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
-from poise.motion import read_clip
 from poise.motion.noise import robustness_levels
 from poise.recipes.imitation import Imitation
 

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyConfig, BodyTable, generate_table
-from poise.kin.ik.bend import rotate
-from poise.kin.ik.body import IkBody, ik_body
+from poise.kinematics.ik_body import IkBody, ik_body, rotate
 from poise.motion import Skeleton
-from poise.spatial import matrix_to_quat
+from poise.motion.rotations import matrix_to_quat
 
 #: Directions (left, up, forward) along which bones of a T-pose point. A foot points forward and down.
 _ALONG = {

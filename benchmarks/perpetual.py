@@ -52,10 +52,10 @@ from speed import machine
 
 from poise.env import Acts
 from poise.errors import PoiseError
-from poise.eval import Nothing
 from poise.learn.checkpoint import write_atomic
 from poise.motion import ClipLibrary
 from poise.plan import SamplingConfig
+from poise.score import Nothing
 
 PARTS = ("table", "search", "recovery", "owners", "noise", "noisy", "speed", "curves")
 Save = Callable[[], None]

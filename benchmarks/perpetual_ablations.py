@@ -25,21 +25,21 @@ import perpetual_rows
 from tracker import SIXTY
 
 from poise.body import BodyConfig
-from poise.cli.perpetual_report import shown
+from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
 from poise.jobs import runs
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.result import RESULT
-from poise.jobs.perpetual.run import begin, clips_of, resume, train
+from poise.jobs.perpetual.run import RESULT, begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
 from poise.jobs.warm_start import widened
 from poise.learn import AmpConfig, LessonConfig, Until
 from poise.motion import ClipLibrary
 from poise.plan import TeacherConfig
-from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual.shapes import BodyShapes
+from poise.recipes.perpetual import build
+from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.residual_force import ResidualForce
+from poise.recipes.shapes import BodyShapes
 
 #: Every row adds what its name says to the one before; the last three stand for themselves.
 LADDER = {

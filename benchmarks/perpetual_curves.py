@@ -12,7 +12,7 @@ from typing import Any
 from field.sources import by_source
 
 from poise.errors import PoiseError
-from poise.view.svg import line_plot
+from poise.score.report.svg import line_plot
 
 #: What a curve shows: its key, its title, its axis.
 PANELS = (
@@ -20,7 +20,7 @@ PANELS = (
     ("help", "Residual force that is left", "N"),
     ("error", "Global error of the stage's clips", "mm"),
 )
-#: Height of one panel, px; `view.svg` draws all plots in this size.
+#: Height of one panel, px; `score.report.svg` draws all plots in this size.
 HIGH, WIDE = 300, 560
 
 

@@ -14,14 +14,14 @@ from perpetual_measure import Run, Tell, library_task
 from speed import bench_latency, machine
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
+from poise.formats.raw import ReadOptions as Stated
 from poise.jobs.library.files import motion_files_of
 from poise.jobs.track import TrackConfig, side_by_side, track
-from poise.jobs.track.crowd import crowd as in_one_world
 from poise.jobs.track.noise import robustness
-from poise.jobs.track.points import points_of
+from poise.jobs.track.placement import points_of
+from poise.jobs.track.supports import crowd as in_one_world
 from poise.motion import ClipLibrary
-from poise.motion.io import read_clip
-from poise.motion.io.raw import ReadOptions as Stated
 from poise.motion.noise import robustness_levels
 
 

@@ -18,10 +18,6 @@ from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import ClipResults
-from poise.eval.episodes import run_episodes
-from poise.eval.recovery import KINDS, recovery_card, trial_task
-from poise.eval.rolloutset import RolloutSet
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.jobs.library.folder import library_of
@@ -32,10 +28,14 @@ from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
-from poise.learn.progressive import primitive
+from poise.learn.composer import Composer
+from poise.learn.primitives import primitive
 from poise.motion import Clip, ClipLibrary
-from poise.nets import Composer
 from poise.recipes.imitation import Imitation
+from poise.score import ClipResults
+from poise.score.episodes import run_episodes
+from poise.score.recovered import KINDS, recovery_card, trial_task
+from poise.score.rollouts import RolloutSet
 from poise.settings import to_data
 
 Tell = Callable[[str], None]

@@ -20,11 +20,11 @@ import torch
 from field.table import field_table
 from torch import Tensor
 
-from poise.eval.episodes import run_episodes
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.result import RESULT
+from poise.jobs.perpetual.run import RESULT
 from poise.learn import LATEST, Policy, load_policy
 from poise.recipes.imitation import Imitation
+from poise.score.episodes import run_episodes
 
 #: Of a run that was measured, in its folder.
 ROW = "row.json"

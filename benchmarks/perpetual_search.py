@@ -12,12 +12,12 @@ from field.table import field_table
 from perpetual_measure import Run
 
 from poise.env import Acts, ImitationEnv
-from poise.eval.episodes import run_episodes
-from poise.eval.rolloutset import RolloutSet
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.track.searching import look_for, replay
+from poise.jobs.track.recovering import look_for, replay
 from poise.plan import SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
+from poise.score.episodes import run_episodes
+from poise.score.rollouts import RolloutSet
 
 Tell = Callable[[str], None]
 

@@ -5,9 +5,10 @@
 FOLDER holds the sets for development with their `INDEX.tsv`, part of the library of `tracker/README.md`
 among them; `--also` adds an AMC file with its skeleton. A clip is judged as a file that states its rate,
 so that nothing is taken; named is one with clear evidence for another rate. With `--raw` what is judged
-already is read from there, so that an interrupted run goes on. The constants of `poise.kin.rate` were
-chosen on the sources in `CHOSEN`; the others were only measured. The last rows judge the part of the
-shipped tracker's library that is in FOLDER at the rates at which it was learned.
+already is read from there, so that an interrupted run goes on. The constants of
+`poise.kinematics.rate` were chosen on the sources in `CHOSEN`; the others were only measured. The last
+rows judge the part of the shipped tracker's library that is in FOLDER at the rates at which it was
+learned.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ import numpy as np
 
 from poise.body import generate_table
 from poise.errors import PoiseError
-from poise.kin.rate.judge import judge_rate
-from poise.motion import Clip, read_clip
+from poise.formats import read_clip
+from poise.kinematics.rate import judge_rate
+from poise.motion import Clip
 
 COMMAND = "python benchmarks/rates.py --data FOLDER --also 88_01.amc=08.asf"
 COLUMNS = ("subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command")

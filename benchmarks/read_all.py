@@ -24,8 +24,9 @@ from typing import Any
 import torch
 
 from poise.errors import PoiseError
-from poise.kin import by_kind, examine
-from poise.motion import describe, read_clip
+from poise.formats import read_clip
+from poise.kinematics import by_kind, examine
+from poise.motion import describe
 
 ASF = 0.0254 / 0.45
 COMMAND = "python benchmarks/read_all.py --data FOLDER"

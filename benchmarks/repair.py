@@ -38,15 +38,16 @@ from repair_rivals import filtered, filters, foot_lock, standing
 from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
+from poise.formats.point_fit import fit_clip
+from poise.formats.point_noise import fill
 from poise.jobs.track import track
-from poise.kin import examine, heal
-from poise.kin.doctor.doctor import READ_ONLY
-from poise.motion import Clip, read_clip, trim
-from poise.motion.edits import resample
+from poise.kinematics import examine, heal
+from poise.kinematics.repair.doctor import READ_ONLY
+from poise.motion import Clip, trim
+from poise.motion.clip import resample
 from poise.motion.keypoints import Keypoints
-from poise.motion.points import fit_clip
-from poise.motion.points.clean import fill
-from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
+from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
 
 COLUMNS = ("subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command")
 #: Clips that the repair was made with, which are not measured.

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.kin import examine, heal
-from poise.kin.doctor.doctor import READ_ONLY
-from poise.kin.doctor.faults import read_faults
-from poise.motion import Clip, read_clip
+from poise.formats import read_clip
+from poise.kinematics import examine, heal
+from poise.kinematics.repair.doctor import READ_ONLY
+from poise.kinematics.repair.faults import read_faults
+from poise.motion import Clip
 
 FILES = (
     "noisy/pose2sim/*/*.trc", "noisy/rokoko_video/*.bvh", "kimodo/*.npz",

@@ -19,9 +19,9 @@ import numpy as np
 from repair import KINDS, dirty
 from repair_rivals import one_euro
 
-from poise.kin.fading import of_points
+from poise.kinematics.stream_noise import of_points
 from poise.live.people import Steady
-from poise.live.sources.file import Loop
+from poise.live.sources import Loop
 from poise.motion import Clip
 
 KINDS_LIVE, SIZES_MM, CLIPS = ("white", "tone5"), (10.0, 25.0, 50.0), 10

@@ -11,9 +11,9 @@ from scipy.signal import butter, savgol_filter, sosfiltfilt
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError
-from poise.kin.feet.lead import Lead, led
-from poise.kin.series import find_runs
+from poise.kinematics.hold import Lead, led
 from poise.motion import Clip
+from poise.motion.smoothing import find_runs
 
 CUTOFFS = (0.5, 0.7, 1, 1.3, 1.6, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 10, 12)
 WINDOWS = (5, 7, 9, 13, 17, 23, 31)

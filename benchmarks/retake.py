@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import Tracked, track
 from poise.jobs.track.retaking import FADE_S
 from poise.jobs.track.simulation import Retake
-from poise.motion import read_clip, trim
+from poise.motion import trim
 
 #: Ten seconds of each at most.
 CLIPS = (

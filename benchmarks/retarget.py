@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from poise.kin import RetargetReport, retarget
-from poise.motion import Clip, read_clip, trim
-from poise.spatial import quat_distance
+from poise.formats import read_clip
+from poise.kinematics import RetargetReport, retarget
+from poise.motion import Clip, trim
+from poise.motion.rotations import quat_distance
 
 CLIPS = {
     "Bandai walk": "other/bandai_bvh/dataset-2_walk_active_005.bvh",

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from poise.motion.io import read_clip, write_clip
+from poise.formats import read_clip, write_clip
 
 #: Takes of walking, jogging and running by their names, without those walked backwards.
 GAITS = re.compile(

@@ -28,13 +28,14 @@ import rfc_order_tables
 import torch
 
 from poise.body import BodyConfig
-from poise.eval import start_frames
-from poise.eval.episodes import frames_from
+from poise.formats import read_clip
 from poise.jobs.runs import begin, evaluate, train
 from poise.learn import LATEST, Until, load_policy
-from poise.motion import Clip, ClipLibrary, read_clip
+from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
+from poise.score import start_frames
+from poise.score.episodes import frames_from
 
 #: File and frames per second of each clip. All of CMU's are said to have 120, but in 90_08 and 90_11
 #: bodies fall as they do at 60.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from poise.view import line_plot
+from poise.score.report import line_plot
 
 Runs = dict[str, dict[str, Any]]
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
-from poise.eval import ClipJudge, simulate
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import Placed, place
@@ -32,7 +32,7 @@ from poise.jobs.tracker import Tracker
 from poise.learn import PolicyBundle
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import acceleration_error, jerk
-from poise.motion import read_clip
+from poise.score import ClipJudge, simulate
 
 #: Damping of the servos in s (None: the body's own), deviation of the noise that is averaged over, and
 #: whether it is on velocities alone.

@@ -15,7 +15,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 CLIPS = {
     "walk": "other/bandai_bvh/dataset-1_walk_normal_001.bvh",

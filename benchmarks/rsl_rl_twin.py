@@ -30,14 +30,14 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from poise.env.rsl_rl import GROUP, RslRlVecEnv
+from poise.env.faces import GROUP, RslRlVecEnv
+from poise.formats import read_clip
 from poise.jobs.runs import evaluate
 from poise.learn import Trainer, VecEnv
 from poise.motion import ClipLibrary
-from poise.motion.io import read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
-from poise.view.svg import line_plot
+from poise.score.report.svg import line_plot
 
 #: Samples, seconds of training; of the deterministic policy Succ, reward per step, joint error in mm;
 #: and the reward of the last training step, noise included.

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 
 from poise.body import BodyConfig
+from poise.formats import read_clip
 from poise.jobs.runs import evaluate
 from poise.jobs.warm_start import clone_expert, finetuning
 from poise.learn import Trainer
-from poise.motion.io import read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
+from poise.score.report import line_plot
 from poise.sim import SimConfig
-from poise.view import line_plot
 
 KINDS = ("paper", "additive", "expert")
 CLIP = ("cmu_amc/rfc/90_02.amc", "cmu_amc/rfc/08.asf")

@@ -18,12 +18,12 @@ from pathlib import Path
 import torch
 
 from poise.env import Reference
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import Keeper, imitation_of
-from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import place
+from poise.jobs.track.supports import crowd
 from poise.jobs.tracker import Tracker
-from poise.motion import read_clip
 
 CLIPS = tuple(f"cmu_amc/02/02_{k}.amc" for k in ("05", "07", "09", "10"))
 

@@ -26,22 +26,23 @@ import torch
 from torch import Tensor
 
 from poise.env import Reference
-from poise.eval.inbetween import BANDAI, deviation
+from poise.formats import read_clip
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track import track
-from poise.kin import IkBody, clip_ik, fit_humanoid
-from poise.kin.solids import lowest_height
+from poise.kinematics import IkBody, clip_ik, fit_humanoid
+from poise.kinematics.forward import lowest_height
 from poise.learn import Until
 from poise.metrics import l2p
-from poise.motion import Clip, ClipLibrary, read_clip, shifted, trim
+from poise.motion import Clip, ClipLibrary, shifted, trim
+from poise.motion.rotations import forward_kinematics
 from poise.motion.windows import pack_frames
 from poise.papers.compliant.training import digest_of
 from poise.papers.skeleton2humanoid.recipe import Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.spatial import forward_kinematics
+from poise.score.gaps import BANDAI, deviation
 
 PAST, AFTER, FPS = 10, 5, 30.0
 VARIANTS = ("uhc", "one frame", "no curriculum", "full", "full to zero")

@@ -16,7 +16,8 @@ import torch
 from speed.standing import measure, scaled, table_lines
 
 from poise.body import generate_table
-from poise.motion import Clip, read_clip
+from poise.formats import read_clip
+from poise.motion import Clip
 
 #: Skeletons of as many makers: name, clip, its skeleton file.
 CLIPS = {

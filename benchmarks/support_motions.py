@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from poise.jobs.tracker import Tracker
-from poise.kin import lowest_height, match_positions, qpos_to_clip
+from poise.kinematics import lowest_height, match_positions, qpos_to_clip
 from poise.motion import Clip
-from poise.spatial import (
+from poise.motion.rotations import (
     axis_angle_to_quat,
     forward_kinematics,
     quat_conj,

@@ -20,11 +20,12 @@ from support_motions import MOTIONS, motion
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import Tracked, track
-from poise.jobs.track.missing import needs_of
 from poise.jobs.track.placement import place
+from poise.jobs.track.tracked import needs_of
 from poise.jobs.track.tracking import imitation_of, read_motion
 from poise.jobs.tracker import Tracker
-from poise.kin.supports import Support, find_supports
+from poise.kinematics.find_supports import find_supports
+from poise.kinematics.supports import Support
 from poise.motion import Clip
 
 SUFFIXES = (".bvh", ".amc", ".npz", ".npy", ".txt", ".glb")

@@ -26,7 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from poise.body import BodyConfig
-from poise.cli.perpetual_report import shown
+from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
@@ -35,8 +35,7 @@ from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import SMALL_STEP, widened
 from poise.learn import ConvergenceConfig, Until
 from poise.plan import TrajOptConfig
-from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual.config import PushPlan
+from poise.recipes.perpetual_settings import Perpetual, PushPlan
 
 #: Dances, a kick, boxing and exercises.
 HELD_OUT = ("cmu 05$", "cmu 11$", "cmu 14$")

@@ -26,16 +26,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from poise.eval import RolloutSet
+from poise.formats import read_clip
 from poise.jobs.deliver import deliver
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.learn import IterationStats, Until
 from poise.motion import ClipLibrary
-from poise.motion.io import read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, task
-from poise.view import line_plot
+from poise.score import RolloutSet
+from poise.score.report import line_plot
 
 RFC, CMU, MIMIC = "cmu_amc/rfc", "cmu_amc/02", "deepmimic_txt"
 #: Path, skeleton, frames per second where the file's default is wrong, and for the clips of the paper

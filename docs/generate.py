@@ -31,15 +31,18 @@ SHOWN: tuple[tuple[str, str, str], ...] = (
     ("Results", "poise", "Tracked Imitated Completed Inbetweened Dreamt Run PoiseError"),
     ("Settings", "poise", "TrackConfig ResidualForce Perpetual Inbetween Dream"),
     ("Motion", "poise.motion", "Clip ClipLibrary Skeleton trim resample"),
-    ("Kinematics", "poise.kin", "retarget fit_humanoid"),
-    ("Kinematics", "poise.kin.supports", "find_supports"),
-    ("Scores", "poise.eval.card", "ScoreCard Help"),
-    ("Scores", "poise.eval", "read_score run_episodes simulate RolloutSet Transitions"),
+    ("Motion", "poise.formats", "read_clip write_clip"),
+    ("Kinematics", "poise.kinematics", "retarget heal fit_humanoid analytic_ik"),
+    ("Kinematics", "poise.kinematics.find_supports", "find_supports"),
+    ("Scores", "poise.score", "ScoreCard Help read_score run_episodes simulate RolloutSet Transitions"),
     ("Tasks", "poise.recipes", "build"),
     ("Tasks", "poise.recipes.imitation", "Imitation"),
     ("Environments", "poise.env", "TaskConfig ImitationEnv EnvStep Frame ObsTerm RewardTerm DoneTerm"),
     ("Environments", "poise.env", "GymVectorEnv GymEnv"),
-    ("Environments", "poise.env.events", "Pushes Push InScene SetDown Throw"),
+    ("Environments", "poise.env.faces", "RslRlVecEnv"),
+    ("Environments", "poise.env.pushes", "Pushes Push"),
+    ("Environments", "poise.env.events", "InScene"),
+    ("Environments", "poise.env.things", "SetDown Throw"),
     ("Environments", "poise.control", "Compliance Stiffness"),
     ("Learning", "poise.learn", "PPOConfig Until run Trainer"),
     ("Simulation", "poise.sim", "Scene Character Link Touch SceneSim SimConfig make_backend Mechanics"),
@@ -264,7 +267,7 @@ def packages() -> str:
 
 def formats() -> str:
     """What is read and written, from the table of readers and writers."""
-    from poise.motion.io.formats import READERS, WRITERS
+    from poise.formats import READERS, WRITERS
 
     refused = ("ASF", "robot", "OpenPose")
     rows = ["| format | files | read | written |", "|---|---|---|---|"]
@@ -293,7 +296,7 @@ def commands() -> str:
 
 def verdicts() -> str:
     """From when on a figure of a score card is good or fair."""
-    from poise.eval.card import THRESHOLDS
+    from poise.score import THRESHOLDS
 
     rows = ["| key | good | fair |", "|---|---|---|"]
     rows += [f"| `{key}` | {t.good:g} | {t.fair:g} |" for key, t in THRESHOLDS.items()]

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from make_dream_svg import COLOURS, RIGHT, UP, side
 
-from poise.motion.io import read_clip
+from poise.formats import read_clip
 
 RATE, SCALE, WIDE, HIGH, NEAR, SMOOTH = 10, 110.0, 640, 320, 2, 45
 

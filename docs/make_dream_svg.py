@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from poise.formats import read_clip
 from poise.motion import Clip
-from poise.motion.io import read_clip
 
 SCALE, WIDE, HIGH, ROW = 62.0, 86.0, 150.0, 10
 #: Where the camera looks from: to the right and up in the picture, per metre of X, Y, Z.

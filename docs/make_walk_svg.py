@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from poise.formats import read_clip
 from poise.motion import Clip
-from poise.motion.io import read_clip
 
 SIZE = (860, 380)
 SCALE = 158.0  # pixels in a metre

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.motion import Clip, Skeleton
-from poise.spatial import quat_conj, quat_mul, quat_rotate, rotvec_to_quat
+from poise.motion.rotations import quat_conj, quat_mul, quat_rotate, rotvec_to_quat
 
 #: role, parent role, offset (m, facing +x, left is +y, arms hanging).
 _MIDDLE = (

@@ -89,10 +89,10 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an untrained in-betweening network for the embedded walk."""
-    from poise.learn.model import MODEL, InbetweenModel, make_net, save_model
-    from poise.motion import read_clip
+    from poise.formats import read_clip
+    from poise.learn.inbetween import MODEL, InbetweenModel, make_net, save_model
+    from poise.learn.transition import Layout
     from poise.motion.windows import pack_frames
-    from poise.nets.transition import Layout
     from toy_windows import SMALL
 
     bank = pack_frames([read_clip(WALK)])
@@ -167,7 +167,7 @@ def test_named_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
 def _is_setting(option: str) -> bool:
     """Whether `--style.lr` and the like name a setting of a recipe, as in its TOML file."""
     from poise.recipes import ResidualForce
-    from poise.recipes.perpetual import Perpetual
+    from poise.recipes.perpetual_settings import Perpetual
 
     def inside(value: object, path: list[str]) -> bool:
         return not path or (hasattr(value, path[0]) and inside(getattr(value, path[0]), path[1:]))

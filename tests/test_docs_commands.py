@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from poise.cli.main import main
+from poise.formats import read_clip, write_clip
 from poise.jobs.endless.training import Endless
-from poise.motion import Clip, read_clip, trim
-from poise.motion.io import write_clip
-from poise.nets.cvae import CVAEConfig
+from poise.learn.cvae import CVAEConfig
+from poise.motion import Clip, trim
 from poise.recipes import ResidualForce
 from poise.settings import to_toml
 from test_docs import WALK, _commands

@@ -8,7 +8,7 @@ from poise.errors import PoiseError
 from poise.jobs.inbetween.training import Inbetween
 from poise.learn import PPOConfig
 from poise.recipes import ResidualForce
-from poise.recipes.perpetual import Perpetual, RecoveryPlan
+from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
 
 
 @pytest.mark.parametrize(

@@ -31,22 +31,22 @@ EXPLAINED = {
     "figures of the benchmarks": (
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
         "jobs/tracker.py:Tracker.with_damping",
-        "papers/compliant/throw_figures.py:throws",
+        "papers/compliant/figures.py:throws",
     ),
     "analytic inverse kinematics, which keyframes will need": (
-        "kin/ik/analytic.py:clip_ik",
-        "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
+        "kinematics/ik.py:clip_ik",
+        "kinematics/ik.py:polish", "kinematics/limbs.py:two_bone",
     ),
     "for users of the library": (
-        "jobs/imitate.py:imitate", "eval/card.py:read_score", "env/gym.py:GymVectorEnv",
-        "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv",
-        "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
+        "jobs/imitate.py:imitate", "score/card.py:read_score", "env/faces.py:GymVectorEnv",
+        "env/faces.py:GymEnv", "env/faces.py:RslRlVecEnv",
+        "formats/smpl.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
-        "sim/props/lift.py:Lift",
-        "papers/compliant/teams.py:Teams", "papers/compliant/training.py:save_learned",
+        "sim/props.py:Lift",
+        "papers/compliant/opponents.py:Teams", "papers/compliant/training.py:save_learned",
     ),
     "called by the libraries that they belong to": (
-        "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",
+        "env/faces.py:GymVectorEnv.close_extras", "formats/pickles.py:_Machine.find_class",
     ),
 }  # fmt: skip
 

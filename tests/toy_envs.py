@@ -10,7 +10,8 @@ import torch
 
 from poise.control import PDTargets, range_scale
 from poise.env import DoneTerm, ImitationEnv, ObsTerm
-from poise.env.terms import done, phc_obs, phc_reward
+from poise.env import observations as obs
+from poise.env import rewards as reward
 from poise.motion import Clip
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
@@ -43,14 +44,14 @@ def make_phc(make_task: Callable[..., Imitation]) -> Callable[..., Imitation]:
     def make(*clips: Clip) -> Imitation:
         built = make_task(*clips, method="deepmimic")
         humanoid = built.humanoid
-        apart = {"bodies": done.all_but_feet(humanoid), "grace": 1}
+        apart = {"bodies": reward.all_but_feet(humanoid), "grace": 1}
         task = replace(
             built.task,
-            obs=(ObsTerm("self", phc_obs.self_state), ObsTerm("goal", phc_obs.rotation_goal)),
-            rewards=(*phc_reward.imitation_terms(), phc_reward.energy_term()),
-            dones=(DoneTerm("any_body_too_far", done.any_body_too_far, apart),),
+            obs=(ObsTerm("self", obs.self_state), ObsTerm("goal", obs.rotation_goal)),
+            rewards=(*reward.imitation_terms(), reward.energy_term()),
+            dones=(DoneTerm("any_body_too_far", reward.any_body_too_far, apart),),
             pd=PDTargets("absolute", range_scale(torch.tensor(humanoid.model.jnt_range[1:]))),
-            style=phc_obs.style_terms(humanoid),
+            style=obs.style_terms(humanoid),
         )
         return replace(built, task=task)
 

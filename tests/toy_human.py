@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from poise.motion import Clip, Skeleton
-from poise.spatial import euler_to_quat, quat_mul, quat_rotate, rotvec_to_quat, unwrap_quats
+from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate, rotvec_to_quat, unwrap_quats
 
 #: name, parent, offset from the parent (m) of the middle and the left; the right is mirrored.
 _MIDDLE = (("Hips", "", (0, 0, 0)), ("Spine", "Hips", (0, 0, 0.12)), ("Chest", "Spine", (0, 0, 0.2)))

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from poise.eval import ClipResults
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, RecoveryPlan
+from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
+from poise.score import ClipResults
 from toy_human import swing
 
 #: kind of policy, columns, largest share of the help, clip -> does it succeed?

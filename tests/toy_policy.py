@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import poise
+from poise.formats import read_clip
 from poise.jobs.perpetual import run as perpetual_run
 from poise.learn import PPOConfig, Until
-from poise.motion import Clip, ClipLibrary, read_clip, trim
-from poise.recipes.perpetual import Perpetual
+from poise.motion import Clip, ClipLibrary, trim
+from poise.recipes.perpetual_settings import Perpetual
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 PPO = PPOConfig(

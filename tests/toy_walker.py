@@ -1,13 +1,13 @@
-"""A small human that walks in place, with feet that bear exactly: the truth of `kin.travel`."""
+"""A small human that walks in place, with feet that bear exactly: the truth of `kinematics.travel`."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from poise.kin.limbs import match_positions
+from poise.kinematics.limbs import match_positions
 from poise.motion import Clip
-from poise.spatial import euler_to_quat, forward_kinematics, quat_between, quat_mul
+from poise.motion.rotations import euler_to_quat, forward_kinematics, quat_between, quat_mul
 from toy_human import human
 
 #: m: the pelvis, and the ankles of a foot that bears, whose toes are on the floor.

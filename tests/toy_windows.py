@@ -6,11 +6,11 @@ import math
 
 import torch
 
-from poise.learn.frames import FrameData
+from poise.learn.between import BetweenConfig
+from poise.learn.rtn import RTNConfig
+from poise.learn.transition import Known, Layout
+from poise.learn.windows import FrameData
 from poise.motion.windows import FrameBank, pack_frames, step_contacts, train_statistics
-from poise.nets.between import BetweenConfig
-from poise.nets.rtn import RTNConfig
-from poise.nets.transition import Known, Layout
 from toy_human import swing
 
 SMALL = BetweenConfig(width=32, layers=2, heads=2, feedforward=48, latent=3)
@@ -45,7 +45,7 @@ def known(of: FrameBank, past: int = 10, length: int = 12, dtype: torch.dtype = 
 
 def moved(k: Known, yaw: float, xy: tuple[float, float]) -> tuple[Known, torch.Tensor, torch.Tensor]:
     """The same elsewhere and turned; the turn and the way."""
-    from poise.spatial import quat_mul, quat_rotate
+    from poise.motion.rotations import quat_mul, quat_rotate
 
     turn = torch.tensor([math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)], dtype=torch.float64)
     turn, way = turn.to(k.past_root), torch.tensor([*xy, 0.0]).to(k.past_root)

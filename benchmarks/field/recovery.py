@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from field.paper import PHC_RECOVERY
-from poise.eval.recovery import SECONDS, RecoveryCard
+from poise.score.recovered import SECONDS, RecoveryCard
 
 
 def recovery_markdown(card: RecoveryCard) -> str:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from field.card import FIGURES, ClipErrors, Errors, FieldTable, View
 from poise.errors import PoiseError
-from poise.eval.rolloutset import RolloutSet, Sums, judge
 from poise.metrics import (
     SuccessRule,
     acceleration_error,
@@ -28,6 +27,7 @@ from poise.metrics import (
     success_rule,
     velocity_error,
 )
+from poise.score.rollouts import RolloutSet, Sums, judge
 
 
 def field_table(

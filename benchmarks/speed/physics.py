@@ -10,13 +10,13 @@ from typing import Any
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.eval import run_episodes, score_rollouts
 from poise.jobs.open import open_run
 from poise.jobs.runs import help_left, trained_policy
 from poise.jobs.warm_start import some_starts
 from poise.learn import PolicyBundle
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import build
+from poise.score import run_episodes, score_rollouts
 from poise.sim import SimConfig
 from speed.engine import Progress
 from speed.stable_pd import StablePDBackend

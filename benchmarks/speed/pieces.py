@@ -16,12 +16,13 @@ from tracker import config as tracker_config
 import poise
 from poise.body import BodyConfig
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import clips_of
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.motion import ClipLibrary, read_clip
+from poise.motion import ClipLibrary
 from poise.plan import TeacherConfig
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation

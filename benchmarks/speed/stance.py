@@ -12,7 +12,7 @@ import torch
 from poise.body import Humanoid
 from poise.body.table import BodyRow
 from poise.errors import PoiseError
-from poise.spatial import quat_to_matrix
+from poise.motion.rotations import quat_to_matrix
 
 #: Angles of the relaxed pose: knees and elbows, rad; arms away from the trunk, degrees (the first of
 #: these at which they touch nothing).

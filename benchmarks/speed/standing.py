@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from poise.body import BodyConfig, Humanoid
-from poise.kin import Kinematics, fit_ground, fit_humanoid, lowest_height
+from poise.kinematics import Kinematics, fit_ground, fit_humanoid, lowest_height
 from poise.motion import Clip, Skeleton
 from poise.sim import SimConfig, alone
 from speed.stance import Stance, polygon_margin, relaxed_stance

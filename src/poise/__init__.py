@@ -23,28 +23,27 @@ from poise.errors import PoiseError
 from poise.version import __version__
 
 if TYPE_CHECKING:
+    from poise.formats import write_clip as write
     from poise.jobs.complete import Completed, complete
-    from poise.jobs.endless.config import Dream
     from poise.jobs.endless.dreaming import dream
-    from poise.jobs.endless.dreamt import Dreamt
+    from poise.jobs.endless.dreamt import Dream, Dreamt
     from poise.jobs.imitate import Imitated, imitate
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
     from poise.jobs.inbetween.training import Inbetween
     from poise.jobs.open import Run, open_run
     from poise.jobs.push import push
     from poise.jobs.track import TrackConfig, Tracked, track
-    from poise.kin.rate.reading import read_clip as read
+    from poise.kinematics.rate import read_clip as read
     from poise.motion import Clip, ClipLibrary
-    from poise.motion import write_clip as write
     from poise.recipes import ResidualForce
-    from poise.recipes.perpetual import Perpetual
+    from poise.recipes.perpetual_settings import Perpetual
 
 #: Where each name of the face is; it has the same name there unless another one follows.
 _PLACES = {
     "Clip": "poise.motion",
     "ClipLibrary": "poise.motion",
     "Completed": "poise.jobs.complete",
-    "Dream": "poise.jobs.endless.config",
+    "Dream": "poise.jobs.endless.dreamt",
     "Dreamt": "poise.jobs.endless.dreamt",
     "Imitated": "poise.jobs.imitate",
     "Inbetween": "poise.jobs.inbetween.training",
@@ -60,9 +59,9 @@ _PLACES = {
     "inbetween": "poise.jobs.inbetween.fill",
     "open_run": "poise.jobs.open",
     "push": "poise.jobs.push",
-    "read": "poise.kin.rate.reading:read_clip",
+    "read": "poise.kinematics.rate:read_clip",
     "track": "poise.jobs.track",
-    "write": "poise.motion:write_clip",
+    "write": "poise.formats:write_clip",
 }
 
 __all__ = [

@@ -15,7 +15,7 @@ from field.sources import source_of, source_table
 from field.table import field_table
 
 from poise.errors import PoiseError
-from poise.eval.rolloutset import RolloutSet
+from poise.score.rollouts import RolloutSet
 
 
 def rollouts(

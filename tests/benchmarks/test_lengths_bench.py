@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import poise
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 
 def test_walks_are_joined_into_a_long_one():

@@ -27,7 +27,8 @@ from lookahead_sets import CONDITIONS, Condition, budgets_of, disturbed
 from lookahead_text import MARK, put_into, tables
 
 from poise.errors import PoiseError
-from poise.motion import read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import trim
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from toy_human import swing

@@ -9,7 +9,7 @@ from next_frames import NextFrame, NextFrameConfig, NextFrameObjective, NextFram
 from poise.errors import PoiseError
 from poise.learn.cvae import Frames
 from poise.learn.inbetween import InbetweenTrainer
-from poise.synth.place_free import ROOT
+from poise.synthesis.generator import ROOT
 
 HINGES = 3
 SMALL = {

@@ -16,13 +16,15 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import write_clip
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.learn import ConvergenceConfig, Until
-from poise.motion import ClipLibrary, write_clip
-from poise.nets import Composer
-from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual.shapes import BodyShapes, shaped
+from poise.learn.composer import Composer
+from poise.motion import ClipLibrary
+from poise.recipes.perpetual import build, task
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.shapes import BodyShapes, shaped
 from toy_policy import PPO, toy_run, walk
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

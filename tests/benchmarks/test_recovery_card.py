@@ -15,10 +15,10 @@ from poise.control import PDTargets
 from poise.env import Recovery, TaskConfig
 from poise.env.recovery.falls import Drop
 from poise.errors import PoiseError
-from poise.eval import recovery_card, trial_task
-from poise.eval.recovery import KINDS, back_after
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
+from poise.score import recovery_card, trial_task
+from poise.score.recovered import KINDS, back_after
 from toy_human import swing
 
 

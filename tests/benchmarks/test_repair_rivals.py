@@ -9,8 +9,8 @@ from repair import dirty
 from repair_rivals import foot_lock, standing
 
 from poise.body import find_anatomy
-from poise.kin.series import find_runs
-from poise.motion import read_clip
+from poise.formats import read_clip
+from poise.motion.smoothing import find_runs
 
 
 def test_a_foot_lock_keeps_feet_where_they_touch_down() -> None:

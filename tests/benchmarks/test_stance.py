@@ -14,8 +14,9 @@ from speed.standing import measure, scaled, stand
 
 from poise.body import Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import Kinematics, fit_humanoid, lowest_height
-from poise.motion import Clip, read_clip, trim
+from poise.formats import read_clip
+from poise.kinematics import Kinematics, fit_humanoid, lowest_height
+from poise.motion import Clip, trim
 from rigs import rig
 from toy_human import human, swing
 
@@ -128,7 +129,7 @@ def test_children_and_giants_stand_at_the_same_settings(height):
 
 def test_strength_that_follows_mass_alone_lets_a_giant_sag_more():
     # The reason for the rule: the same giant with the strength of its mass alone.
-    from poise.body.presets import length_factor
+    from poise.body.table import length_factor
 
     clip = scaled(swing(), 3.5 / generate_table(human()).height_m)
     full = body_of(clip)

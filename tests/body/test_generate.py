@@ -12,10 +12,11 @@ import torch
 
 from poise.body import BodyConfig, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import Kinematics, contact_labels, fit_humanoid, lowest_height
-from poise.motion import Clip, read_clip, trim
+from poise.formats import read_clip
+from poise.kinematics import Kinematics, contact_labels, fit_humanoid, lowest_height
+from poise.motion import Clip, trim
+from poise.motion.rotations import quat_rotate
 from poise.sim import alone
-from poise.spatial import quat_rotate
 from toy_human import human, swing
 
 #: Short real clips of every dialect, the ASF of those that need one, hinges and bodies.

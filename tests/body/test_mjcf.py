@@ -10,7 +10,7 @@ from speed.stance import relaxed_stance
 
 from poise.body import BodyConfig, make_humanoid, read_mjcf
 from poise.errors import PoiseError
-from poise.kin import Kinematics, fit_humanoid
+from poise.kinematics import Kinematics, fit_humanoid
 from poise.recipes.residual_force import ResidualForce, build
 from rigs import rig
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from poise.cli.main import main
+from poise.formats import read_clip, write_clip
 from poise.jobs.library.files import is_motion
-from poise.motion import read_clip, write_clip
 
 
 def test_a_pickle_is_asked_for_and_becomes_npz_and_csv(

@@ -87,8 +87,8 @@ def test_a_huge_line(tmp_path: Path, refused, monkeypatch: pytest.MonkeyPatch) -
     with sparse.open("r+b") as file:
         file.truncate(300_000_000)
     refused("info", sparse, words=("binary",))
-    monkeypatch.setattr("poise.motion.io.text.MAX_LINE_BYTES", 1000)
-    monkeypatch.setattr("poise.motion.io.text._CHUNK", 100)
+    monkeypatch.setattr("poise.formats.text.MAX_LINE_BYTES", 1000)
+    monkeypatch.setattr("poise.formats.text._CHUNK", 100)
     long = put(tmp_path, "b.bvh", bvh([ROW, "0 " * 2000]))
     refused("info", long, words=("line 29", "longer"))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from poise.cli.answer import Answer
+from poise.cli.console import Answer
 from poise.cli.demo import WALK
 from poise.cli.main import main
 from poise.jobs.run_file import RUN_FILE

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from tiny_clips import bvh, put
 
-from poise.cli.doctor_motion import _hidden_rate, worsened
+from poise.cli.doctor import _hidden_rate, worsened
 from poise.cli.info import _guess
 from poise.cli.main import main
-from poise.kin import Examination, Fault
-from poise.motion import read_clip, shifted, write_clip
+from poise.formats import read_clip, write_clip
+from poise.kinematics import Examination, Fault
+from poise.motion import shifted
 
 WALK = Path(str(files("poise") / "data/walk.bvh"))
 
@@ -201,8 +202,8 @@ def test_sides_can_be_exchanged(tmp_path: Path, capsys) -> None:
 
 
 def test_keypoints_state_their_evidence(tmp_path: Path, answered) -> None:
-    from poise.motion.io.points.raw import RawPoints, assemble_points
-    from poise.motion.io.raw import ReadOptions
+    from poise.formats.point_raw import RawPoints, assemble_points
+    from poise.formats.raw import ReadOptions
 
     clip = read_clip(WALK)
     points = clip.positions() * 1000
@@ -213,8 +214,8 @@ def test_keypoints_state_their_evidence(tmp_path: Path, answered) -> None:
 
 def test_feet_without_names_are_not_called_named(tmp_path: Path) -> None:
     """Feet that their place alone tells are said to be told so."""
-    from poise.kin.doctor.guesses import find_guesses
-    from poise.motion import read_clip
+    from poise.formats import read_clip
+    from poise.kinematics.repair.guesses import find_guesses
 
     clip = read_clip(WALK)
     named = next(g for g in find_guesses(clip) if g.what == "feet")

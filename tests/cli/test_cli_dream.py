@@ -10,10 +10,9 @@ import pytest
 from poise.cli.dream import targets_of
 from poise.cli.main import main
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.jobs.endless.training import Endless
-from poise.motion import read_clip
-from poise.motion.io import write_clip
-from poise.nets.cvae import CVAEConfig
+from poise.learn.cvae import CVAEConfig
 from poise.settings import to_toml
 from toy_policy import walk
 

@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 from tiny_clips import deepmimic, put
 
-from poise.cli.fleet import Options, clips_in, plan
+from poise.cli.fleet import Options, plan
 from poise.cli.main import main
+from poise.cli.options import clips_in
 
 TINY = ["--set", "envs=16", "--set", "iterations=2"]
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from tiny_clips import deepmimic, put
 
-from poise.cli.answer import INTERRUPTED, LOST, Answer
-from poise.cli.folder import each
+from poise.cli.console import INTERRUPTED, LOST, Answer
 from poise.cli.main import main
+from poise.cli.options import each
+from poise.formats import read_clip, write_clip
+from poise.formats.refused import LOOKED_AT, refuse_flat_folder
 from poise.jobs.library.files import motion_files_of
 from poise.jobs.library.folder import library_of
-from poise.motion import read_clip, trim, write_clip
-from poise.motion.io.refused import LOOKED_AT, refuse_flat_folder
+from poise.motion import trim
 from toy_policy import WALK, toy_run
 
 #: The walk's joints in the order of SMPL's.

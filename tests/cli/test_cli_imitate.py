@@ -15,12 +15,11 @@ from pathlib import Path
 import pytest
 
 from poise.cli.main import main
-from poise.cli.progress import clock
-from poise.cli.training import command_line
+from poise.cli.training import clock, command_line
 from poise.errors import PoiseError
-from poise.eval import TRACKING
 from poise.jobs.keep import claimed
 from poise.learn import CloneConfig
+from poise.score import TRACKING
 
 MINIATURE = ["--envs", "16", "--threads", "1"]
 #: Control steps of cloning the expert, 16 characters at once.

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from poise.cli.main import main
+from poise.formats import read_clip
 from poise.jobs.inbetween.fill import shipped_model
-from poise.learn.model import load_model
-from poise.motion import read_clip
+from poise.learn.inbetween import load_model
 
 
 def test_it_fills_without_training_and_keeps_keyframes(

@@ -13,10 +13,11 @@ import pytest
 from tiny_clips import MINIATURE
 
 import poise
-from poise.cli.answer import Answer, document
+from poise.cli.console import Answer, document
 from poise.cli.main import VERBS, main
 from poise.errors import PoiseError
-from poise.motion import read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import trim
 from poise.settings import plain
 from toy_policy import WALK, toy_run
 
@@ -110,7 +111,7 @@ def test_faults_and_unknown_verbs(
         print("a library prints")
         raise ZeroDivisionError
 
-    monkeypatch.setattr("poise.motion.io.read_clip", broken)
+    monkeypatch.setattr("poise.formats.read_clip", broken)
     found = answered("info", short, code=1)
     assert "ZeroDivisionError" in found["error"]["what"] and "fault of Poise" in found["error"]["hint"]
 

@@ -10,7 +10,7 @@ import pytest
 from tiny_clips import MINIATURE, put
 
 from poise.cli.main import main
-from poise.cli.output import places
+from poise.cli.options import places
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 

@@ -15,7 +15,7 @@ from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import LATEST, CloneConfig, PPOConfig
 from poise.recipes import perpetual
-from poise.recipes.perpetual import Perpetual, RecoveryPlan
+from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
 from poise.settings import from_toml
 
 MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
@@ -167,7 +167,7 @@ def test_all_stages_by_one_command(
 def test_ctrl_c_saves_and_says_how_to_go_on(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from poise.cli import perpetual_report as perpetual_shown
+    from poise.cli import train_perpetual as perpetual_shown
 
     plain = perpetual_shown.events
 

@@ -10,14 +10,15 @@ from pathlib import Path
 import pytest
 
 import poise
-from poise.cli.answer import LOST
+from poise.cli.console import LOST
 from poise.cli.main import main
-from poise.eval.card import Help
+from poise.formats import read_clip, write_clip
 from poise.jobs import practice
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig
-from poise.motion import read_clip, trim, write_clip
+from poise.motion import trim
 from poise.plan import LookaheadConfig, SamplingConfig
+from poise.score.card import Help
 from toy_policy import WALK, toy_run
 
 

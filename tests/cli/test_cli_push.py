@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from poise.cli.answer import LOST
+from poise.cli.console import LOST
 from poise.cli.main import main
-from poise.motion import read_clip
+from poise.formats import read_clip
 from toy_policy import WALK
 
 ALONE = ("--controller", "policy")

@@ -13,8 +13,9 @@ from poise.body import BodyConfig
 from poise.cli.main import main
 from poise.cli.retarget import pairs
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_bvh, write_clip
 from poise.jobs.library.clips import target_of
-from poise.motion import Clip, Skeleton, read_clip, write_bvh, write_clip
+from poise.motion import Clip, Skeleton
 from toy_human import human, swing
 
 
@@ -114,7 +115,7 @@ def test_bandais_root_survives_the_file(data_dir, tmp_path: Path, capsys) -> Non
     out = tmp_path / "out.bvh"
     assert main(["retarget", str(source), "--onto", str(target), "-o", str(out)]) == 0
     made = read_clip(out)
-    from poise.kin import retarget
+    from poise.kinematics import retarget
 
     wanted, _ = retarget(read_clip(source), read_clip(target))
     assert np.abs(made.positions() - wanted.positions()).max() < 1e-3

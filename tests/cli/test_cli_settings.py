@@ -14,14 +14,14 @@ from poise.cli.main import main
 from poise.cli.parse import parse
 from poise.cli.settings import SOURCES, _fields_of, configured, dotted, stated
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.endless.training import Endless
 from poise.jobs.inbetween.training import Inbetween
 from poise.jobs.presets import preset_of
-from poise.motion import read_clip
-from poise.papers.compliant.recipe import Compliant
+from poise.papers.compliant.training import Compliant
 from poise.plan import TrajOptConfig
 from poise.recipes import ResidualForce
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual
 
 KINDS: dict[str, Any] = {
     "residual-force": ResidualForce,

@@ -11,12 +11,13 @@ import pytest
 from tiny_clips import deepmimic, put
 
 from poise.cli import track as track_verb
-from poise.cli.answer import LOST
+from poise.cli.console import LOST
 from poise.cli.main import main
+from poise.formats import read_clip, write_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import tracking
-from poise.kin import sole_slide
-from poise.motion import read_clip, shifted, trim, write_clip
+from poise.kinematics import sole_slide
+from poise.motion import shifted, trim
 from toy_policy import WALK, toy_run
 
 #: Without lookahead and search, with which even this policy comes far.

@@ -277,7 +277,7 @@ def test_an_unexpected_fault_is_one_sentence(
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("[red]half\nway[/red]")
 
-    monkeypatch.setattr("poise.motion.io.read_clip", broken)
+    monkeypatch.setattr("poise.formats.read_clip", broken)
     assert main(["info", str(clip)]) == 1
     complained = capsys.readouterr().err
     assert complained.count("\n") == 2 and "[red]half way[/red]" in complained
@@ -295,7 +295,7 @@ def test_a_full_disk_and_a_lack_of_memory(
         def broken(*_: object, problem: BaseException = problem, **__: object) -> None:
             raise problem
 
-        monkeypatch.setattr("poise.motion.io.read_clip", broken)
+        monkeypatch.setattr("poise.formats.read_clip", broken)
         assert main(["info", str(clip)]) == code
         complained = capsys.readouterr().err
         assert complained.startswith("reading ") and complained.count("\nerror: ") == 1
@@ -307,7 +307,7 @@ def test_ctrl_c_anywhere(
     def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("poise.motion.io.read_clip", stopped)
+    monkeypatch.setattr("poise.formats.read_clip", stopped)
     assert main(["info", str(clip)]) == 130
     assert capsys.readouterr().err == f"reading {clip}\nerror: interrupted\n"
 

@@ -22,10 +22,10 @@ from poise.control.compliance import (
     softening,
 )
 from poise.errors import PoiseError
-from poise.kin.hinges import chain_quat
+from poise.kinematics.coords import chain_quat
+from poise.motion.rotations import quat_mul, quat_rotate, rotvec_to_quat
 from poise.recipes import ResidualForce, build
 from poise.sim import CpuBackend, Mechanics, SimConfig
-from poise.spatial import quat_mul, quat_rotate, rotvec_to_quat
 from toy_human import swing
 
 POSES = ((0.2, -0.3, 0.5, 0.7, -0.4), (-0.6, 0.4, 0.1, 1.3, 0.5), (0.9, 0.6, -0.8, 0.4, -0.9))

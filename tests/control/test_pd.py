@@ -12,8 +12,9 @@ import torch
 from poise.body import BodyConfig
 from poise.control import PDTargets, stable_pd_torque
 from poise.errors import PoiseError
-from poise.kin import fit_humanoid
-from poise.motion import read_clip, trim
+from poise.formats import read_clip
+from poise.kinematics import fit_humanoid
+from poise.motion import trim
 from poise.sim import Drive, SimConfig
 
 

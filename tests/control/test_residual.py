@@ -12,8 +12,8 @@ import torch
 from poise.body import generate_table, make_humanoid
 from poise.control import ExplicitResidual, ImplicitResidual
 from poise.errors import PoiseError
+from poise.motion.rotations import heading_quat, quat_rotate
 from poise.sim import CpuBackend, Drive
-from poise.spatial import heading_quat, quat_rotate
 from toy_human import human
 
 N = 3

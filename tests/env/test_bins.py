@@ -12,7 +12,8 @@ from torch import Tensor
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
 from poise.env.bins import MotionBins, Outcomes
-from poise.env.starts import EVERY, KEPT, PRIOR, AdaptiveSampling, Starts
+from poise.env.plugins import EVERY, KEPT, PRIOR, AdaptiveSampling
+from poise.env.starts import Starts
 from poise.errors import PoiseError
 from poise.recipes.imitation import Imitation
 from toy_human import swing

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.goals import EndlessGoal
-from poise.env.goals.led import FALLS, RETURNS, TRACKS
-from poise.env.goals.steering import Steering
+from poise.env.generator import EndlessGoal, Steering
+from poise.env.led import FALLS, RETURNS, TRACKS
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of

@@ -7,7 +7,7 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
-from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
+from poise.motion.rotations import axis_angle_to_quat, quat_mul, quat_rotate
 from toy_human import swing
 
 

@@ -8,9 +8,10 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
+from poise.env import observations as obs
+from poise.env import rewards as reward
 from poise.env.frame import Frame, Pose
-from poise.env.terms import done, obs, reward
-from poise.spatial import (
+from poise.motion.rotations import (
     axis_angle_to_quat,
     euler_to_quat,
     heading_quat,
@@ -43,9 +44,9 @@ OBSERVATIONS = [
     (obs.target_bodies, {}),
 ]
 FAILURES = [
-    (done.root_too_low, {}),
-    (done.bodies_too_far, {}),
-    (done.any_body_too_far, {}),
+    (reward.root_too_low, {}),
+    (reward.bodies_too_far, {}),
+    (reward.any_body_too_far, {}),
 ]
 
 
@@ -222,14 +223,14 @@ def test_failures_by_hand():
     sim = a_pose()
     pos = sim.pos.clone()
     pos[0, 0, 2], pos[1, 0, 2] = 0.69, 0.81  # Lowest allowed: 0.8 - 0.1 and 0.9 - 0.1.
-    assert done.root_too_low(a_frame(replace(sim, pos=pos))).tolist() == [True, False]
+    assert reward.root_too_low(a_frame(replace(sim, pos=pos))).tolist() == [True, False]
     pos = sim.pos.clone()
     pos[0, 2, 0] += 1.2  # Mean over four bodies: 0.3. World 1: 0.6 each.
     pos[1, :, 2] += 0.6
     frame = a_frame(sim, replace(sim, pos=pos))
-    assert done.bodies_too_far(frame, limit=0.5).tolist() == [False, True]
-    assert done.bodies_too_far(frame, limit=0.29).tolist() == [True, True]
-    assert done.any_body_too_far(frame, limit=1.0).tolist() == [True, False]
+    assert reward.bodies_too_far(frame, limit=0.5).tolist() == [False, True]
+    assert reward.bodies_too_far(frame, limit=0.29).tolist() == [True, True]
+    assert reward.any_body_too_far(frame, limit=1.0).tolist() == [True, False]
 
 
 def test_terms_are_pure():

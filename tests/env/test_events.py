@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from poise.env.events import Pushes, Pushing
 from poise.env.plugins import Plugin
+from poise.env.pushes import Pushes, Pushing
 from poise.errors import PoiseError
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build

@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, RewardTerm
+from poise.env.evaluate import MANY, record
 from poise.env.frame import Frame, LazyPose
-from poise.env.recording import record
-from poise.env.terms.evaluate import MANY
-from poise.sim import CpuBackend, body_linear_velocity_w
-from poise.spatial import (
+from poise.motion.rotations import (
     euler_to_quat,
     heading_quat,
     quat_angle,
@@ -25,6 +23,7 @@ from poise.spatial import (
     quat_rotate_inv,
     quat_to_matrix,
 )
+from poise.sim import CpuBackend, body_linear_velocity_w
 from toy_human import swing
 
 #: MB that a recording's constant takes, more than what the C library keeps of what is freed, and how
@@ -221,6 +220,17 @@ def test_a_term_that_looks_at_values_is_never_frozen(make_task):
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("name", ["_create_graph_by_tracing", "_create_function_from_graph"])
+def test_without_torchs_inner_parts_functions_run_as_they_are(monkeypatch, name) -> None:
+    monkeypatch.delattr(torch._C, name)
+
+    def plain(x: Tensor) -> tuple[Tensor, ...]:
+        return (x[:, 2:] * 2.0,)
+
+    x = torch.arange(8.0).reshape(2, 4)
+    assert record(plain, (x,)) is plain
+
+
 def test_recordings_that_are_left_leave_no_memory_behind() -> None:
     """An environment's recordings hold its reference; a folder of clips makes many environments."""
 

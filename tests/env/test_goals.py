@@ -9,10 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv, recording
-from poise.env.goals import DisplacedGoal, GeneratorGoal, Goal, StreamGoal, extrapolated
-from poise.env.goals.goal import FADE_S
+from poise.env import ImitationEnv
+from poise.env import evaluate as recording
+from poise.env.generator import GeneratorGoal
+from poise.env.goal import FADE_S, Goal, extrapolated
 from poise.env.plugins import Plugin
+from poise.env.stream import StreamGoal
+from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build

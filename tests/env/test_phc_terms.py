@@ -12,28 +12,29 @@ from scipy.spatial.transform import Rotation
 
 from poise.body import generate_table, make_humanoid
 from poise.env import ObsTerm, RewardTerm
+from poise.env import observations as obs
+from poise.env import rewards as reward
 from poise.env.frame import Frame, PointGoal, Pose
-from poise.env.terms import done, phc_obs, phc_reward
 from poise.errors import PoiseError
-from poise.spatial import axis_angle_to_quat, heading_quat, normalize, quat_mul, quat_rotate
+from poise.motion.rotations import axis_angle_to_quat, heading_quat, normalize, quat_mul, quat_rotate
 from toy_human import human
 
 N, B, J, H = 3, 5, 4, 6
 TIPS = torch.tensor([2, 4])
 OBSERVATIONS = [
-    (phc_obs.self_state, {}),
-    (phc_obs.rotation_goal, {}),
-    (phc_obs.rotation_goal, {"bodies": torch.tensor([3, 0])}),
-    (phc_obs.keypoint_goal, {}),
-    (phc_obs.keypoint_goal, {"bodies": torch.tensor([3, 0])}),
-    (phc_obs.motion_features, {"tips": TIPS}),
-    (phc_obs.goal_later, {"step": 1, "bodies": torch.tensor([3, 1])}),
+    (obs.self_state, {}),
+    (obs.rotation_goal, {}),
+    (obs.rotation_goal, {"bodies": torch.tensor([3, 0])}),
+    (obs.keypoint_goal, {}),
+    (obs.keypoint_goal, {"bodies": torch.tensor([3, 0])}),
+    (obs.motion_features, {"tips": TIPS}),
+    (obs.goal_later, {"step": 1, "bodies": torch.tensor([3, 1])}),
 ]
 REWARDS = [
-    phc_reward.body_positions,
-    phc_reward.body_rotations,
-    phc_reward.body_velocities,
-    phc_reward.body_angular_velocities,
+    reward.body_positions,
+    reward.body_rotations,
+    reward.body_velocities,
+    reward.body_angular_velocities,
 ]
 
 
@@ -154,20 +155,20 @@ def test_observations_are_free_of_place_and_heading(term, params):
 
 def test_widths_on_phcs_body_are_the_papers():
     smpl = a_frame(a_pose(0, 24, 19, 57), a_pose(1, 24, 19, 57))
-    assert phc_obs.self_state(smpl).shape == (N, 358)
-    assert phc_obs.rotation_goal(smpl).shape == (N, 576)
-    assert phc_obs.keypoint_goal(smpl).shape == (N, 216)
-    assert phc_obs.motion_features(smpl, torch.tensor([3, 4, 20, 21])).shape == (N, 196)
+    assert obs.self_state(smpl).shape == (N, 358)
+    assert obs.rotation_goal(smpl).shape == (N, 576)
+    assert obs.keypoint_goal(smpl).shape == (N, 216)
+    assert obs.motion_features(smpl, torch.tensor([3, 4, 20, 21])).shape == (N, 196)
 
 
 def test_at_the_goal_the_differences_are_nothing():
     sim = a_pose(4)
-    goal = phc_obs.rotation_goal(a_frame(sim, sim))
+    goal = obs.rotation_goal(a_frame(sim, sim))
     assert not goal[:, : 9 * B].any()
     turned = goal[:, 18 * B :].unflatten(1, (B, 6))
     identity = torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(N, B, 6)
     torch.testing.assert_close(turned, identity, atol=1e-6, rtol=0)
-    assert not phc_obs.keypoint_goal(a_frame(sim, sim))[:, : 6 * B].any()
+    assert not obs.keypoint_goal(a_frame(sim, sim))[:, : 6 * B].any()
 
 
 def test_a_keypoint_goal_never_looks_at_rotations():
@@ -176,8 +177,8 @@ def test_a_keypoint_goal_never_looks_at_rotations():
         goal,
         **{k: torch.full_like(getattr(goal, k), torch.nan) for k in ("quat", "angvel", "local", "qpos")},
     )
-    assert phc_obs.keypoint_goal(a_frame(sim, blind)).isfinite().all()
-    for term in (phc_obs.rotation_goal, phc_obs.keypoint_goal):
+    assert obs.keypoint_goal(a_frame(sim, blind)).isfinite().all()
+    for term in (obs.rotation_goal, obs.keypoint_goal):
         with pytest.raises(ValueError, match="next reference frame"):
             term(a_frame(sim))
 
@@ -185,24 +186,24 @@ def test_a_keypoint_goal_never_looks_at_rotations():
 def test_a_later_goal_tells_keypoints_no_turn_and_a_point_nothing():
     frame = a_frame(a_pose(0), a_pose(1))
     bodies = torch.tensor([1, 2])
-    whole = phc_obs.goal_later(frame, 0, bodies)
-    assert torch.equal(phc_obs.goal_later(frame, 0, bodies, turns=False), whole[:, :-2])
+    whole = obs.goal_later(frame, 0, bodies)
+    assert torch.equal(obs.goal_later(frame, 0, bodies, turns=False), whole[:, :-2])
     far = PointGoal(torch.tensor([True, False, False]), torch.ones(N), torch.ones(N))
-    told = phc_obs.goal_later(frame.replaced(point=far), 0, bodies)
+    told = obs.goal_later(frame.replaced(point=far), 0, bodies)
     assert not told[0].any() and torch.equal(told[1:], whole[1:])
 
 
 def test_the_shape_is_limb_lengths_and_masses():
     humanoid = make_humanoid(human(), generate_table(human()))
-    sizes, rows = phc_obs.shape_of(humanoid), humanoid.table.rows
+    sizes, rows = obs.shape_of(humanoid), humanoid.table.rows
     assert sizes.shape == (2 * len(rows) - 1,)
     shin = [r.kind for r in rows].index("shin")
     assert float(sizes[shin - 1]) == pytest.approx(0.42, abs=1e-6)
     assert 10 * float(sizes[len(rows) - 1 :].sum()) == pytest.approx(humanoid.mass, rel=1e-5)
-    out = phc_obs.shape(a_frame(a_pose(0)), sizes)
+    out = obs.shape(a_frame(a_pose(0)), sizes)
     assert out.shape == (N, len(sizes)) and torch.equal(out[2], sizes)
-    assert isinstance(phc_obs.style_terms(humanoid)[0], ObsTerm)
-    tips = phc_obs.style_terms(humanoid)[0].params["tips"].tolist()
+    assert isinstance(obs.style_terms(humanoid)[0], ObsTerm)
+    tips = obs.style_terms(humanoid)[0].params["tips"].tolist()
     assert sorted(rows[i].kind for i in tips) == ["foot", "foot", "hand", "hand"]
 
 
@@ -226,8 +227,8 @@ def test_eq_2_by_hand():
     error[:, 1] = torch.tensor([0.03, 0.0, 0.04])  # 5 cm of one body out of five.
     frame = a_frame(sim, ref=replace(sim, pos=sim.pos + error))
     # code: 0.0025 over 15 numbers; paper: 0.05 over 5 bodies
-    close(phc_reward.body_positions(frame, form="code"), math.exp(-100 * 0.0025 / 15))
-    close(phc_reward.body_positions(frame, form="paper"), math.exp(-100 * 0.01))
+    close(reward.body_positions(frame, form="code"), math.exp(-100 * 0.0025 / 15))
+    close(reward.body_positions(frame, form="paper"), math.exp(-100 * 0.01))
     speed = 40 * error  # 2 m/s, rad/s.
     for term, name in ((REWARDS[2], "linvel"), (REWARDS[3], "angvel")):
         frame = a_frame(sim, ref=replace(sim, **{name: getattr(sim, name) + speed}))
@@ -237,9 +238,9 @@ def test_eq_2_by_hand():
     quat = sim.quat.clone()
     quat[:, 2] = -quat_mul(more, quat[:, 2])  # The other sign is the same rotation.
     frame = a_frame(sim, ref=replace(sim, quat=quat))
-    close(phc_reward.body_rotations(frame, form="code"), math.exp(-10 * 0.09 / 5))
-    close(phc_reward.body_rotations(frame, form="paper"), math.exp(-10 * 0.3 / 5))
-    terms = phc_reward.imitation_terms("paper")
+    close(reward.body_rotations(frame, form="code"), math.exp(-10 * 0.09 / 5))
+    close(reward.body_rotations(frame, form="paper"), math.exp(-10 * 0.3 / 5))
+    terms = reward.imitation_terms("paper")
     assert [t.weight for t in terms] == [0.5, 0.3, 0.1, 0.1] and all(t.imitation for t in terms)
     assert all(t.params == {"form": "paper"} for t in terms)
 
@@ -256,28 +257,28 @@ def test_the_energy_by_hand_and_who_is_exempt():
     torque = torch.zeros(N, H)
     torque[:, 0], torque[:, 2] = -5.0, 4.0
     frame = a_frame(replace(sim, qvel=qvel), age=torch.tensor([1, 3, 4]), torque=torque)
-    assert phc_reward.energy(frame).tolist() == [0.0, 0.0, 22.0]
-    assert phc_reward.energy(frame, form="paper").tolist() == [0.0, 0.0, 244.0]
-    assert phc_reward.energy(frame, exempt=0).tolist() == [22.0] * 3
+    assert reward.energy(frame).tolist() == [0.0, 0.0, 22.0]
+    assert reward.energy(frame, form="paper").tolist() == [0.0, 0.0, 244.0]
+    assert reward.energy(frame, exempt=0).tolist() == [22.0] * 3
     with pytest.raises(ValueError, match="torques"):
-        phc_reward.energy(a_frame(sim))
+        reward.energy(a_frame(sim))
 
 
 def test_the_energy_is_not_halved_by_the_prior():
-    term = phc_reward.energy_term(0.5)
+    term = reward.energy_term(0.5)
     # 0.5 (r_task - 0.001 e) = 0.5 r_task - 0.0005 e
     assert 0.5 * term.weight == pytest.approx(-0.0005) and not term.imitation
-    assert phc_reward.energy_term(1.0, "paper").params["form"] == "paper"
+    assert reward.energy_term(1.0, "paper").params["form"] == "paper"
     with pytest.raises(PoiseError, match="cost"):
-        RewardTerm("energy", phc_reward.energy, -1.0)
+        RewardTerm("energy", reward.energy, -1.0)
 
 
 def test_the_roots_place_by_hand():
     sim = a_pose(0)
     error = torch.zeros(N, B, 3)
     error[:, 0] = torch.tensor([0.06, 0.0, 0.08])
-    close(phc_reward.root_position(a_frame(sim)), 1.0)
-    close(phc_reward.root_position(a_frame(sim, ref=replace(sim, pos=sim.pos + error))), math.exp(-1))
+    close(reward.root_position(a_frame(sim)), 1.0)
+    close(reward.root_position(a_frame(sim, ref=replace(sim, pos=sim.pos + error))), math.exp(-1))
 
 
 def test_prices_of_changes_by_hand_and_the_first_step_is_free():
@@ -285,16 +286,16 @@ def test_prices_of_changes_by_hand_and_the_first_step_is_free():
     before[:, 0], now[:, 1] = 0.3, 0.4
     age = torch.tensor([1, 2, 9])
     frame = a_frame(a_pose(0), age=age, action=now, action_before=before)
-    torch.testing.assert_close(phc_reward.action_rate(frame), torch.tensor([0.0, 0.25 / H, 0.25 / H]))
+    torch.testing.assert_close(reward.action_rate(frame), torch.tensor([0.0, 0.25 / H, 0.25 / H]))
     limits = torch.tensor([3.0, 2.0, 1.0, 1.0, 1.0, 1.0])
     frame = a_frame(a_pose(0), age=age, torque=now, torque_before=before)
     want = (0.01 + 0.04) / H
     torch.testing.assert_close(
-        phc_reward.torque_rate(frame, limits), torch.tensor([0.0, want, want]), atol=1e-7, rtol=0
+        reward.torque_rate(frame, limits), torch.tensor([0.0, want, want]), atol=1e-7, rtol=0
     )
     with pytest.raises(ValueError, match="before"):
-        phc_reward.torque_rate(a_frame(a_pose(0)), limits)
-    term = phc_reward.cost_term(phc_reward.torque_rate, 0.2, 0.5, limits=limits)
+        reward.torque_rate(a_frame(a_pose(0)), limits)
+    term = reward.cost_term(reward.torque_rate, 0.2, 0.5, limits=limits)
     assert term.name == "torque_rate" and term.weight == -0.4 and not term.imitation
 
 
@@ -309,7 +310,7 @@ def test_only_soles_that_touch_the_ground_slide():
     linvel[1, 4, 2] = 0.5  # A foot that rises.
     sim = replace(still, pos=pos, quat=quat, linvel=linvel, angvel=angvel)
     points = torch.tensor([[0.1, 0.0, -0.05], [0.0, 0.0, 0.05]] * 2)
-    told = phc_reward.foot_slide(a_frame(sim), torch.tensor([3, 3, 4, 4]), points)
+    told = reward.foot_slide(a_frame(sim), torch.tensor([3, 3, 4, 4]), points)
     torch.testing.assert_close(told, torch.tensor([0.3, math.hypot(0.3, 0.1) / 2, 0.15]))
 
 
@@ -324,16 +325,16 @@ def test_relaxed_termination_by_hand():
     apart[2, :4, 2] = 0.6  # All but the foot at 60 cm.
     frame = a_frame(sim, ref=replace(sim, pos=sim.pos + apart), age=torch.tensor([2, 2, 1]))
     rows = torch.arange(4)
-    assert done.bodies_too_far(frame).tolist() == [True, False, False]
-    assert done.bodies_too_far(frame, bodies=rows).tolist() == [False, False, True]
-    assert done.any_body_too_far(frame, bodies=rows).tolist() == [False, True, True]
-    assert done.any_body_too_far(frame, bodies=rows, grace=1).tolist() == [False, True, False]
-    assert done.bodies_too_far(frame, bodies=rows, grace=1).tolist() == [False, False, False]
+    assert reward.bodies_too_far(frame).tolist() == [True, False, False]
+    assert reward.bodies_too_far(frame, bodies=rows).tolist() == [False, False, True]
+    assert reward.any_body_too_far(frame, bodies=rows).tolist() == [False, True, True]
+    assert reward.any_body_too_far(frame, bodies=rows, grace=1).tolist() == [False, True, False]
+    assert reward.bodies_too_far(frame, bodies=rows, grace=1).tolist() == [False, False, False]
     with pytest.raises(ValueError, match="age"):
-        done.any_body_too_far(a_frame(sim), grace=1)
+        reward.any_body_too_far(a_frame(sim), grace=1)
 
 
 def test_all_but_feet_are_all_but_feet():
     humanoid = make_humanoid(human(), generate_table(human()))
-    rows, kept = humanoid.table.rows, done.all_but_feet(humanoid).tolist()
+    rows, kept = humanoid.table.rows, reward.all_but_feet(humanoid).tolist()
     assert [r.kind for i, r in enumerate(rows) if i not in kept] == ["foot", "foot"]

@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 import torch
 
-from poise.env.poser import MANY, Poser
+from poise.env.reference import MANY, Poser
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from toy_human import swing

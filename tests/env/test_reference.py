@@ -9,9 +9,9 @@ import torch
 
 from poise.env import Reference
 from poise.errors import PoiseError
-from poise.kin import fit_humanoid
+from poise.kinematics import fit_humanoid
 from poise.motion import ClipLibrary
-from poise.spatial import heading_quat, quat_angle, quat_conj, quat_mul, quat_rotate
+from poise.motion.rotations import heading_quat, quat_angle, quat_conj, quat_mul, quat_rotate
 from toy_human import swing
 
 FIELDS = ("qpos", "qvel", "pos", "quat", "linvel", "angvel", "com", "local", "heading")

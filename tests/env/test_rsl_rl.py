@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from poise.env.rsl_rl import GROUP, RslRlVecEnv
+from poise.env.faces import GROUP, RslRlVecEnv
 from poise.errors import PoiseError
 
 

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, ObsTerm
-from poise.env.events import InScene, Move, ScenePart, SetDown, Switch, Throw, near
+from poise.env.events import InScene, ScenePart
 from poise.env.frame import Frame
+from poise.env.things import Move, SetDown, Switch, Throw, near
 from poise.errors import PoiseError
 from poise.motion import ClipLibrary
-from poise.papers.compliant.teams import Teams
+from poise.papers.compliant.opponents import Teams
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Link, Scene, SceneSim, Touch

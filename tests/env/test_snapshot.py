@@ -11,14 +11,15 @@ from torch import Tensor
 
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
-from poise.env.goals import DisplacedGoal, LedGoal
+from poise.env.led import LedGoal
+from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build as build_perpetual
-from poise.recipes.perpetual.shapes import BodyShapes
-from poise.recipes.perpetual.task import stage_task
+from poise.recipes.perpetual import stage_task
+from poise.recipes.shapes import BodyShapes
 from toy_human import swing
 from toy_library import PLAIN, library, lively, tiny
 

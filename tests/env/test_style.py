@@ -9,9 +9,9 @@ import torch
 
 from poise.control import range_scale
 from poise.env import ImitationEnv
+from poise.env import rewards as reward
+from poise.env.evaluate import MANY, seen_by
 from poise.env.style import ClipFeatures, ClipWindows
-from poise.env.terms import phc_reward
-from poise.env.terms.evaluate import MANY, seen_by
 from poise.errors import PoiseError
 from poise.recipes.imitation import Imitation
 from poise.sim import make_backend
@@ -142,7 +142,7 @@ def test_recordings_and_halves_are_the_plain_terms(task):
 
 def test_torques_are_those_of_the_servos_and_the_damping(task):
     backend, model = make_backend(task.model, 2, "cpu", threads=1), task.humanoid.model
-    energy = (phc_reward.energy_term(1.0, exempt=0),)
+    energy = (reward.energy_term(1.0, exempt=0),)
     env = ImitationEnv(task.reference, backend, replace(task.task, rewards=energy, auto_reset=False), 1)
     env.reset_to(torch.tensor([0, 1]), torch.tensor([3, 5]))
     u, q = 0.1 + env.backend.state.qpos[:, 7:].clone(), env.backend.state.qpos[:, 7:].clone()

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from poise.env import ImitationEnv, Reference
-from poise.eval import run_episodes
 from poise.learn import PPOConfig
 from poise.learn.train import Trainer
+from poise.score import run_episodes
 from poise.sim import Drive, NanGuard, WarpBackend
 from toy_human import swing
 from warp_device import WARP_DEVICE, needs_warp

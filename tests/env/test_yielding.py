@@ -11,9 +11,10 @@ import torch
 
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
-from poise.env.events import InScene, Pushes, SetDown, touches_of
-from poise.env.goals import DisplacedGoal
-from poise.env.yielding import Yielding
+from poise.env.events import InScene, touches_of
+from poise.env.pushes import Pushes
+from poise.env.things import SetDown
+from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.learn import PPOConfig
 from poise.motion import ClipLibrary

@@ -1,6 +1,6 @@
 """Parsers in native code without the start of a process for each file: the worker forks.
 
-`poise.motion.io.limited` starts Python and imports a library for every file, some 200 ms. Here the
+`poise.formats.limited` starts Python and imports a library for every file, some 200 ms. Here the
 process that fuzzes has the library already, and a child of it runs the same script (`apart`) under the
 same limits, its answer and its end taken in the same way: 20 to 60 ms.
 """
@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import Any
 
-from poise.motion.io import apart, limited
+from poise.formats import apart, limited
 
 #: The libraries of formats.
 LIBRARIES = {

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion import Clip, describe, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip, describe
 
 #: Longest sentence behind the file's name, and time that any file of up to 1 MB may take, s.
 LONGEST, SECONDS = 300, 6.0

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from poise.motion import read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import trim
 
 _TESTS = Path(__file__).resolve().parents[1]
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from poise.formats import read_clip, write_clip
 from poise.motion import Clip
-from poise.motion.io import read_clip, write_clip
 from toy_human import swing
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 FOLDER = Path(__file__).resolve().parents[2] / "integrations" / "comfyui" / "poise_nodes"
 WALK = Path(str(files("poise") / "data/walk.bvh"))

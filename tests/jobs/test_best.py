@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from poise.eval import ScoreCard, score_rollouts
-from poise.eval.card import NO_HELP
-from poise.eval.rolloutset import RolloutSet, judge
-from poise.jobs.track.best import LOST, SURVIVED, TRACKED, Merit, merit
+from poise.jobs.track.controllers import LOST, SURVIVED, TRACKED, Merit, merit
 from poise.metrics import has_lost, success_rule
+from poise.score import ScoreCard, score_rollouts
+from poise.score.card import NO_HELP
+from poise.score.rollouts import RolloutSet, judge
 
 
 def episodes(*fails: int | None, frames: int = 40, off: float = 0.05) -> RolloutSet:

@@ -14,17 +14,18 @@ from poise.body import find_anatomy
 from poise.cli.complete import _say
 from poise.cli.main import main
 from poise.errors import PoiseError
+from poise.formats import write_clip
 from poise.jobs import complete as completing
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.direction import Direction, Weight, direction_of, rows_of
 from poise.jobs.tracker import Tracker
-from poise.kin import without_noise
-from poise.kin.directed import Pin, TouchPoint, directed, pinned
-from poise.motion import Clip, write_clip
+from poise.kinematics import without_noise
+from poise.kinematics.directed import Pin, TouchPoint, directed, pinned
+from poise.motion import Clip
 from poise.plan import LookaheadConfig
-from poise.synth.retime import Retiming, retimed
+from poise.synthesis.inbetween import Retiming, retimed
 from toy_human import swing, trembling
 from toy_policy import walk
 

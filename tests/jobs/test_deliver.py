@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from poise.eval import Recording
+from poise.formats import read_clip
 from poise.jobs.deliver import deliver, finished, floor_of, lost_at, simulated_clip
 from poise.jobs.runs import Evaluation, evaluate
-from poise.kin import examine, sole_slide
-from poise.motion import Clip, ClipLibrary, ground_shift, read_clip
+from poise.kinematics import examine, sole_slide
+from poise.motion import Clip, ClipLibrary, ground_shift
 from poise.recipes import ResidualForce, build
+from poise.score import Recording
 from toy_human import swing
 
 

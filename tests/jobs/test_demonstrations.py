@@ -11,20 +11,18 @@ import torch
 from poise.env.recovery.clips import CALM, QUICK
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.demonstrations import demonstrations, odds, practised
 from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.perpetual.run import begin, going_on, resume, train
-from poise.jobs.perpetual.stage_initialisation import Owners, staged
 from poise.jobs.perpetual.stage_order import Progress, Stage
+from poise.jobs.perpetual.stage_start import Owners, demonstrations, odds, practised, staged
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
-from poise.nets import Composer
-from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual.config import WIDE
-from poise.recipes.perpetual.recovery import standing
-from poise.recipes.perpetual.shapes import BodyShapes
+from poise.learn.composer import Composer
+from poise.recipes.perpetual import build, standing
+from poise.recipes.perpetual_settings import WIDE, Perpetual
+from poise.recipes.shapes import BodyShapes
 from toy_human import swing
 from toy_library import PLAIN, Scripted, library, lively, tiny
 

@@ -14,12 +14,13 @@ import pytest
 
 import poise
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
+from poise.formats.text import write_whole
 from poise.jobs.open import open_run
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import train
 from poise.learn import Until
-from poise.motion import Clip, read_clip, trim, write_clip
-from poise.motion.io.text import write_whole
+from poise.motion import Clip, trim
 
 OLD = Path(__file__).resolve().parents[1] / "fixtures/old"
 WALK = Path(poise.__file__).parent / "data/walk.bvh"

@@ -10,13 +10,13 @@ import torch
 
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.distillation import PolicyTeacher, distilled, taught_by
 from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.stage_start import PolicyTeacher, distilled, taught_by
 from poise.jobs.tracker import Tracker
 from poise.learn import Until
-from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual.config import BodyShapes
-from poise.recipes.perpetual.task import build
+from poise.recipes.perpetual import build
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.shapes import BodyShapes
 from toy_library import PLAIN, library, tiny
 
 

@@ -13,22 +13,20 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.eval.card import NO_HELP
-from poise.jobs.endless import frames
-from poise.jobs.endless.config import Dream
+from poise.formats import read_clip
+from poise.jobs.endless import dreamt as frames
 from poise.jobs.endless.dreaming import begun, dream, past_of
-from poise.jobs.endless.frames import Body, FrameStore, Pieces
+from poise.jobs.endless.dreamt import NUMBER, Body, Dream, FrameStore, MotionWriter, Pieces
 from poise.jobs.endless.model import GeneratorModel
 from poise.jobs.endless.training import Endless, motions_of, train_generator
-from poise.jobs.endless.writing import NUMBER, MotionWriter
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.kin import hold_feet
-from poise.learn.cvae import CVAETraining
-from poise.motion import ClipLibrary, read_clip, trim
-from poise.nets.cvae import CVAEConfig
+from poise.kinematics import hold_feet
+from poise.learn.cvae import CVAEConfig, CVAETraining
+from poise.motion import ClipLibrary, trim
 from poise.plan import LookaheadConfig
+from poise.score.card import NO_HELP
 from toy_policy import walk
 
 SMALL = CVAEConfig(past=10, future=12, latent=4, hidden=32, layers=(32,))

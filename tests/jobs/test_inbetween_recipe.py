@@ -10,12 +10,21 @@ import pytest
 
 from poise.cli.main import main
 from poise.errors import PoiseError
-from poise.jobs.inbetween.data import library_bank, motion_files
-from poise.jobs.inbetween.training import FRAMES, Inbetween, begin, prepare, small, steps_in, train
+from poise.formats import read_clip, write_bvh
+from poise.jobs.inbetween.training import (
+    FRAMES,
+    Inbetween,
+    begin,
+    library_bank,
+    motion_files,
+    prepare,
+    small,
+    steps_in,
+    train,
+)
 from poise.jobs.run_file import RUN_FILE
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.model import load_model, save_model
-from poise.motion import read_clip, write_bvh
+from poise.learn.inbetween import load_model, save_model
 from toy_human import swing
 
 
@@ -55,7 +64,7 @@ def test_a_library_is_read_once(library: Path, tmp_path: Path, monkeypatch: pyte
     cache = tmp_path / "bank.safetensors"
     first, _ = library_bank(library, cache)
     reads: list[Path] = []
-    monkeypatch.setattr("poise.jobs.inbetween.data.read_clip", lambda p: reads.append(p))
+    monkeypatch.setattr("poise.jobs.inbetween.training.read_clip", lambda p: reads.append(p))
     again, _ = library_bank(library, cache)
     assert reads == [] and again.clips == first.clips and bool((again.rot == first.rot).all())
     assert again.facing == first.facing and again.feet == first.feet

@@ -8,14 +8,19 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.jobs.endless.labels import clips_of_seeds, kinds_of, names_of, read_labels
-from poise.jobs.endless.model import GeneratorModel, load_generator
+from poise.jobs.endless.model import (
+    GeneratorModel,
+    clips_of_seeds,
+    kinds_of,
+    load_generator,
+    names_of,
+    read_labels,
+)
 from poise.jobs.endless.training import Endless, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.learn.cvae import CVAETraining
+from poise.learn.cvae import CVAEConfig, CVAETraining
 from poise.motion import ClipLibrary
-from poise.nets.cvae import CVAEConfig
 from toy_policy import walk
 
 SMALL = CVAEConfig(past=10, future=12, latent=4, hidden=16, decoder="cosine", cosines=6, blocks=1)

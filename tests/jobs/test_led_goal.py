@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
-from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
+from poise.env.led import FALLS, RETURNS, TRACKS, LedGoal
 from poise.env.recovery.clips import QUICK, RecoveryClips
-from poise.env.recovery.entry import entry
+from poise.env.recovery.planner import entry
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from toy_library import PLAIN, lively, tiny

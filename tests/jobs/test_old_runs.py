@@ -17,18 +17,19 @@ import numpy as np
 import pytest
 import torch
 
-from poise.eval import ScoreCard
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips, try_recovery
 from poise.jobs.runs import evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.searching import look_for, replay
+from poise.jobs.track.recovering import look_for, replay
 from poise.jobs.tracker import Tracker
 from poise.learn import Until, load_checkpoint
-from poise.motion import read_clip, trim
+from poise.motion import trim
 from poise.plan import SamplingConfig, SamplingResult
+from poise.score import ScoreCard
 
 OLD = Path(__file__).resolve().parents[1] / "fixtures/old"
 TRACKER, EXPECTED = OLD / "tracker.safetensors", OLD / "expected.json"

@@ -14,7 +14,7 @@ from poise.jobs.open import open_run
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import load_checkpoint, save_checkpoint
 from poise.recipes import ResidualForce
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual
 from toy_policy import toy_run
 
 OLD = Path(__file__).resolve().parents[1] / "fixtures/old"

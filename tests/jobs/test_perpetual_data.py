@@ -12,16 +12,16 @@ import torch
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
+from poise.formats import write_clip
 from poise.jobs.library import folder as perpetual_data
-from poise.jobs.library.clips import LibraryConfig
+from poise.jobs.library.clips import LibraryConfig, LibraryReport
 from poise.jobs.library.files import content_key, is_motion, motion_files_of, subject_of
 from poise.jobs.library.folder import library_of, split
-from poise.jobs.library.report import LibraryReport
-from poise.kin import Kinematics, fit_humanoid
-from poise.kin.coords import clip_to_qpos
-from poise.kin.feet.contact import stance_heights
-from poise.motion import Clip, shifted, write_clip
-from poise.motion.spectrum import white_mm
+from poise.kinematics import Kinematics, fit_humanoid
+from poise.kinematics.coords import clip_to_qpos
+from poise.kinematics.feet import stance_heights
+from poise.motion import Clip, shifted
+from poise.motion.smoothing import white_mm
 from toy_human import human, swing, trembling
 
 

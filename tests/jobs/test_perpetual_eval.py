@@ -9,14 +9,15 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv
-from poise.eval import ClipResults, clip_results, run_episodes, score_rollouts
 from poise.jobs.perpetual.evaluation import History, evaluate_clips
-from poise.jobs.perpetual.stage_initialisation import Owners
+from poise.jobs.perpetual.stage_start import Owners
 from poise.learn import PolicyBundle, compose, first_column, next_column
-from poise.learn.progressive import primitive
+from poise.learn.primitives import primitive
 from poise.metrics import mpjpe_global
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
+from poise.score import ClipResults, run_episodes, score_rollouts
+from poise.score import rollouts as clip_results
 from toy_library import library, tiny
 
 

@@ -19,10 +19,10 @@ from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.jobs.warm_start import widened
 from poise.learn import Until, Value
 from poise.motion import ClipLibrary
+from poise.motion.rotations import quat_mul
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
-from poise.recipes.perpetual.config import PushPlan
-from poise.spatial import quat_mul
+from poise.recipes.perpetual_settings import PushPlan
 from toy_human import swing
 from toy_library import library, tiny
 

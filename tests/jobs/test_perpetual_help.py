@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from poise.control import SuccessHelp
-from poise.eval import ClipResults
-from poise.jobs.perpetual import result, stage_evaluation
-from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.perpetual import run as result
+from poise.jobs.perpetual import stage_trainer as stage_evaluation
+from poise.jobs.perpetual.evaluation import StageRecord, evaluate_clips, mean_help
 from poise.jobs.perpetual.run import begin
-from poise.jobs.perpetual.stage_record import StageRecord, mean_help
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
-from poise.recipes.perpetual.config import config_of
+from poise.recipes.perpetual_settings import config_of
+from poise.score import ClipResults
 from poise.settings import to_data
 from toy_library import PPO, Scripted, library, tiny
 
@@ -164,7 +164,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     def hasty() -> SuccessHelp:
         return SuccessHelp(lower_at=0.6, raise_at=0.59, factor=0.8, every=2)
 
-    monkeypatch.setattr(import_module("poise.recipes.perpetual.task"), "SuccessHelp", hasty)
+    monkeypatch.setattr(import_module("poise.recipes.perpetual"), "SuccessHelp", hasty)
 
 
 def test_a_resumed_run_helps_each_clip_as_before(

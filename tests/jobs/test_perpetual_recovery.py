@@ -10,27 +10,26 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.env.recovery.clock import RecoveryClock
-from poise.env.recovery.config import FALLEN, FAR
+from poise.env.recovery.clock import FALLEN, FAR, RecoveryClock
 from poise.errors import PoiseError
-from poise.eval import ClipResults
 from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import evaluation as perpetual_recovery
-from poise.jobs.perpetual.evaluation import back, check_falls, try_recovery
-from poise.jobs.perpetual.run import begin, config_of, to_data, train
-from poise.jobs.perpetual.stage_initialisation import Owners, staged
+from poise.jobs.perpetual.evaluation import RECOVERY_WORTH, StageRecord, back, check_falls, try_recovery
+from poise.jobs.perpetual.run import begin, train
 from poise.jobs.perpetual.stage_order import Progress, Stage
-from poise.jobs.perpetual.stage_record import RECOVERY_WORTH, StageRecord
+from poise.jobs.perpetual.stage_start import Owners, staged
 from poise.jobs.run_file import FINAL, RUN_FILE
 from poise.learn import Until, compose, first_column, load_checkpoint, load_policy, next_column
 from poise.learn.checkpoint import save_checkpoint
-from poise.learn.progressive import primitive
+from poise.learn.composer import Composer
+from poise.learn.primitives import primitive
 from poise.motion import Clip, ClipLibrary
-from poise.nets import Composer
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual.recovery import standing, walking_clips
+from poise.recipes.perpetual import build, standing, walking_clips
+from poise.recipes.perpetual_settings import Perpetual, config_of
+from poise.score import ClipResults
+from poise.settings import to_data
 from toy_human import swing
 from toy_library import library, tiny
 

@@ -11,15 +11,16 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual import stage_initialisation as perpetual_next
+from poise.jobs.perpetual import stage_start as perpetual_next
 from poise.jobs.perpetual import stage_trainer as perpetual_stages
-from poise.jobs.perpetual.run import begin, config_of, resume, to_data, train
+from poise.jobs.perpetual.run import begin, resume, train
 from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual, config_of
+from poise.settings import to_data
 from toy_library import library, tiny
 
 ITERATIONS = 16

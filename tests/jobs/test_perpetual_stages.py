@@ -12,17 +12,17 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual import result as perpetual_result
-from poise.jobs.perpetual import stage_evaluation as perpetual_judge
+from poise.jobs.perpetual import run as perpetual_result
+from poise.jobs.perpetual import stage_trainer as perpetual_judge
 from poise.jobs.perpetual.run import PerpetualResult, begin, train
 from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, ConvergenceConfig, IterationStats, Trainer, Until, load_policy
-from poise.learn.progressive import primitive
-from poise.nets import Composer
+from poise.learn.composer import Composer
+from poise.learn.primitives import primitive
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual
 from poise.sim import UnstableError
 from toy_library import PPO, Script, Scripted, library, tiny
 

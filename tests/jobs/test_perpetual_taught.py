@@ -12,7 +12,7 @@ from poise.jobs.perpetual.run import begin, going_on, resume, train
 from poise.jobs.warm_start import widened
 from poise.learn import LATEST, LessonConfig, Until, load_checkpoint
 from poise.plan import TeacherConfig
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual
 from toy_library import PLAIN, library, tiny
 
 TEACHER = TeacherConfig(worlds=2, candidates=4, horizon=3, hold_steps=2, best=2, decisions=2)

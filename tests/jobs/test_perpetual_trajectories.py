@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual.demonstrations import PATHS
 from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.stage_start import PATHS
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
 from poise.plan import TrajOptConfig, TrajOptStats
-from poise.recipes.perpetual.config import config_of
-from poise.recipes.perpetual.shapes import BodyShapes
+from poise.recipes.perpetual_settings import config_of
+from poise.recipes.shapes import BodyShapes
 from poise.settings import to_data
 from toy_library import library, tiny
 

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 from poise.control import ImplicitResidual
-from poise.env.terms import phc_reward, reward
+from poise.env import rewards as reward
 from poise.errors import PoiseError
 from poise.jobs.inbetween.training import Inbetween
 from poise.jobs.presets import NAMES, preset_of
 from poise.recipes import ResidualForce, build
-from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual import build as build_perpetual
+from poise.recipes.perpetual_settings import Perpetual
 from poise.settings import from_data, to_data
 from toy_human import swing
 
@@ -215,7 +215,7 @@ def test_the_presets_build_what_they_say() -> None:
     assert next(t for t in code.task.rewards if t.fn is reward.pose).params["half"] is True
     for config in (Perpetual.paper(num_envs=2), Perpetual.code(num_envs=2)):
         phc = build_perpetual(swing(), config)
-        energy = next(t for t in phc.task.rewards if t.fn is phc_reward.energy)
+        energy = next(t for t in phc.task.rewards if t.fn is reward.energy)
         assert energy.params["form"] == config.energy_form
         # The penalty is not halved with the task's reward.
         assert energy.weight * 0.5 == pytest.approx(-0.0005)

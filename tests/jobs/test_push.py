@@ -12,14 +12,14 @@ import torch
 
 import poise
 from poise.control import Stiffness
-from poise.env.events import OnePush, Push
+from poise.env.pushes import OnePush, Push
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, track, write
 from poise.jobs.track.placement import place
 from poise.jobs.track.pushed import PushConfig, back_after, from_the_front, row_of, unforeseen, with_push
 from poise.jobs.tracker import Tracker
-from poise.motion import read_clip
 from poise.recipes.imitation import Imitation
 from toy_human import swing
 from toy_policy import WALK

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poise.jobs import settled as module
-from poise.jobs.settled import settled
-from poise.kin import examine
-from poise.motion import Clip, read_clip
+from poise.formats import read_clip
+from poise.jobs import deliver as module
+from poise.jobs.deliver import settled
+from poise.kinematics import examine
+from poise.motion import Clip
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual.demonstrations import MOST, clone_for
 from poise.jobs.perpetual.stage_order import (
     Stage,
     ends,
@@ -16,9 +15,9 @@ from poise.jobs.perpetual.stage_order import (
     most_help,
     primitives,
 )
+from poise.jobs.perpetual.stage_start import MOST, clone_for
 from poise.learn import CloneConfig
-from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual.config import RecoveryPlan
+from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
 from toy_library import tiny
 
 

@@ -11,15 +11,14 @@ import pytest
 import torch
 from test_best import episodes
 
-from poise.eval import score_rollouts
-from poise.eval.rolloutset import judge
 from poise.jobs.track import controllers
-from poise.jobs.track.best import Merit, merit
-from poise.jobs.track.config import TrackConfig
-from poise.jobs.track.controllers import Done, done_by
-from poise.jobs.track.story import story
+from poise.jobs.track.controllers import Done, Merit, done_by, merit
+from poise.jobs.track.settings import TrackConfig
+from poise.jobs.track.tracked import story
 from poise.metrics import success_rule
 from poise.plan import SamplingResult
+from poise.score import score_rollouts
+from poise.score.rollouts import judge
 
 FRAMES = 40
 

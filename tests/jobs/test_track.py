@@ -13,23 +13,23 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
-from poise.eval import Recording, run_episodes, score_rollouts
+from poise.formats import read_clip
+from poise.formats.point_fit import JOINT_PLACES
+from poise.formats.raw import ReadOptions as Options
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
 from poise.jobs.track import Keeper, TrackConfig, imitation_of, look_ahead, track, write
 from poise.jobs.track.controllers import NO_CRITIC
-from poise.jobs.track.placement import home, place
-from poise.jobs.track.points import points_of
+from poise.jobs.track.placement import home, place, points_of
 from poise.jobs.tracker import Tracker
-from poise.kin.hinges import within_turns
-from poise.motion import Clip, Skeleton, ground_shift, read_clip
-from poise.motion.io.raw import ReadOptions as Options
-from poise.motion.joint_map import map_joints
+from poise.kinematics.coords import within_turns
+from poise.motion import Clip, Skeleton, ground_shift
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Jitter
-from poise.motion.points.fit import JOINT_PLACES
+from poise.motion.roles import map_joints
+from poise.motion.rotations import quat_mul
 from poise.plan import LookaheadConfig
-from poise.spatial import quat_mul
+from poise.score import Recording, run_episodes, score_rollouts
 from toy_human import swing
 from toy_policy import toy_run, walk
 

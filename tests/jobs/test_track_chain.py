@@ -14,14 +14,15 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv, Reference
-from poise.env.goals.led import RETURNS, TRACKS, LedGoal
+from poise.env.led import RETURNS, TRACKS, LedGoal
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import recovering, track, write
-from poise.jobs.track.parts import cut, parts_of
 from poise.jobs.track.placement import home, place, place_all
+from poise.jobs.track.tracked import cut, parts_of
 from poise.jobs.tracker import Tracker
-from poise.motion import Clip, read_clip, shifted, trim
+from poise.motion import Clip, shifted, trim
 from poise.plan import LookaheadConfig
 from toy_human import swing
 from toy_policy import WALK, toy_run, walk

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track, write
-from poise.jobs.track.crowd import APART_M, crowd, places
 from poise.jobs.track.placement import place
+from poise.jobs.track.supports import APART_M, crowd, places
 from poise.jobs.tracker import Tracker
-from poise.motion import read_clip
 from poise.plan import LookaheadConfig
 from poise.sim import CpuBackend, alone
 from toy_human import swing

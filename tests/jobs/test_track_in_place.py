@@ -9,17 +9,18 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.direction import Direction
-from poise.jobs.track.in_place import with_travel
+from poise.jobs.track.rates import with_travel
 from poise.jobs.track.simulation import Retake
 from poise.jobs.tracker import Tracker
-from poise.kin.directed import TouchPoint
-from poise.kin.loops import overlap_of
-from poise.motion import Clip, read_clip
-from poise.spatial import quat_distance
+from poise.kinematics.directed import TouchPoint
+from poise.kinematics.loops import overlap_of
+from poise.motion import Clip
+from poise.motion.rotations import quat_distance
 from toy_policy import walk
 from toy_walker import walker
 

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from poise.eval import read_score, write_score
+from poise.formats import read_clip, write_clip
+from poise.formats.point_fit import fit_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.kin import Kinematics, clean_clip, examine, without_noise
+from poise.kinematics import Kinematics, clean_clip, examine, without_noise
 from poise.metrics import mpjpe_root
-from poise.motion import Clip, read_clip, write_clip
+from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
-from poise.motion.points import fit_clip
-from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
+from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
+from poise.score import read_score, write_score
 
 
 @pytest.fixture(scope="module")

@@ -12,16 +12,16 @@ import torch
 
 from poise.cli.main import main
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track import Tracked, track, write
 from poise.jobs.track.direction import Direction, Weight
-from poise.jobs.track.retaking import FADE_S, SETTLE_S, eased, part_of
+from poise.jobs.track.retaking import FADE_S, SETTLE_S, changed_s, eased, part_of
 from poise.jobs.track.simulation import FILE, Retake, Simulation, read_simulation, retake_of
-from poise.jobs.track.splice import changed_s
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.motion import Clip, read_clip, trim, write_clip
+from poise.motion import Clip, trim
 from poise.plan import LookaheadConfig
 from toy_policy import walk
 

@@ -10,13 +10,13 @@ import pytest
 from support_motions import motion
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, track, write
 from poise.jobs.track.placement import place
 from poise.jobs.track.supports import at_home, on_body
 from poise.jobs.tracker import Tracker
-from poise.kin.supports import Support, read_supports
-from poise.motion import read_clip
+from poise.kinematics.supports import Support, read_supports
 from toy_policy import walk
 
 

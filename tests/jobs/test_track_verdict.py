@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from poise.eval import Help, ScoreCard
 from poise.jobs.track import TrackConfig, rates
-from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.rates import rate_doubts, rate_notes
-from poise.kin.rate.judge import RateJudgement, Reason
+from poise.jobs.track.tracked import shortfalls
+from poise.kinematics.rate import RateJudgement, Reason
+from poise.score import Help, ScoreCard
 from toy_human import swing
 
 NAN = math.nan

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.eval import ScoreCard
 from poise.jobs import warm_start
 from poise.jobs.runs import train
 from poise.jobs.warm_start import (
@@ -23,6 +22,7 @@ from poise.learn import LATEST, PolicyBundle, PPOConfig, Trainer, Until, WarmSta
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
+from poise.score import ScoreCard
 from poise.sim import UnstableError
 from toy_human import swing
 

@@ -8,16 +8,10 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.learn.adapt import (
-    Adaptation,
-    adapt,
-    contact_loss,
-    smoothness_loss,
-)
-from poise.learn.adapt import test_loss as eq4
-from poise.learn.model import make_net
-from poise.nets.between import Between
-from poise.nets.rtn import RTN
+from poise.learn.between import Between
+from poise.learn.inbetween import Adaptation, adapt, contact_loss, make_net, smoothness_loss
+from poise.learn.inbetween import test_loss as eq4
+from poise.learn.rtn import RTN
 from toy_windows import SMALL, SMALL_RTN, bank, known, layout
 
 
@@ -54,7 +48,7 @@ def test_equation_4_starts_at_the_last_frame_seen_and_leaves_the_target_out() ->
     filled = net.fill(k, 12)
     config = Adaptation(beta=0.5)
     total = eq4(net, k, filled, config)
-    from poise.nets.transition import joint_positions
+    from poise.learn.transition import joint_positions
 
     seen = joint_positions(net.layout, k.offsets, k.past_root[:, -1:], k.past_rot[:, -1:])[:, 0]
     by_hand = torch.zeros(2)

@@ -12,9 +12,8 @@ from toy_style_env import FRAMES, StyleEnv, to_the_right
 
 from poise.errors import PoiseError
 from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, TrainingError
-from poise.learn.amp import LEAST, adversarial_loss, style_reward
+from poise.learn.amp import LEAST, Discriminator, adversarial_loss, gradient_penalty, style_reward
 from poise.learn.windows import History, WindowBuffer
-from poise.nets import Discriminator, gradient_penalty
 
 PPO = PPOConfig(std=0.3, horizon=12, epochs=2, policy_hidden=(16,), value_hidden=(16,), minibatch=128)
 AMP = AmpConfig(frames=FRAMES, hidden=(16,), lr=1e-3, steps=3, minibatch=64, kept=96, replay=128)

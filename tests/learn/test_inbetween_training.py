@@ -11,10 +11,16 @@ import torch
 from poise.errors import PoiseError
 from poise.learn.between import BetweenObjective, BetweenTraining, schedule
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.frames import Sampler
-from poise.learn.inbetween import InbetweenTrainer, train_inbetween
-from poise.learn.model import InbetweenModel, load_model, make_net, save_model
+from poise.learn.inbetween import (
+    InbetweenModel,
+    InbetweenTrainer,
+    load_model,
+    make_net,
+    save_model,
+    train_inbetween,
+)
 from poise.learn.rtn import RTNObjective, RTNTraining
+from poise.learn.windows import Sampler
 from toy_windows import SMALL, SMALL_RTN, bank, data
 
 STEPS = 12
@@ -72,8 +78,8 @@ def test_the_truth_has_no_loss_and_slides_where_contact_is_said() -> None:
     batch = Sampler(frames).at(torch.tensor([3]), 20)
     known = torch.ones(20, dtype=torch.bool)
     known[10:19] = False
-    from poise.nets.between import Gap
-    from poise.spatial import matrix_kinematics, quat_to_matrix
+    from poise.learn.between import Gap
+    from poise.motion.rotations import matrix_kinematics, quat_to_matrix
 
     mats = quat_to_matrix(batch.rot)
     truth = matrix_kinematics(frames.layout.parents, batch.offsets.unsqueeze(1), batch.root, mats)

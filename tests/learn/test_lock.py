@@ -11,14 +11,14 @@ import pytest
 from test_inbetween_training import trainer
 
 from poise.errors import PoiseError
-from poise.learn import lock
+from poise.learn import checkpoint as lock
+from poise.learn.checkpoint import only_writer
 from poise.learn.inbetween import train_inbetween
-from poise.learn.lock import only_writer
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="folders cannot be locked there")
 HOLD = """
 import sys, time, pathlib
-from poise.learn.lock import only_writer
+from poise.learn.checkpoint import only_writer
 with only_writer(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

@@ -18,9 +18,9 @@ from toy_parallel import TOY, TwinEnv, spawned, trainer, twin_draws
 
 from poise.errors import PoiseError
 from poise.learn import LAST_GOOD, LATEST, Trainer, Until, load_checkpoint, load_policy, run
+from poise.learn.checkpoint import make_generator
+from poise.learn.networks import RunningNorm
 from poise.learn.parallel import ALONE, any_of, joined, moments, rank_seed, share_of, sums, together
-from poise.learn.state import make_generator
-from poise.nets import RunningNorm
 
 pytestmark = pytest.mark.skipif(not torch.distributed.is_available(), reason="torch without distributed")
 HERE = Path(__file__).resolve().parent

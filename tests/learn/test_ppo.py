@@ -19,9 +19,9 @@ from poise.learn import (
     load_policy,
     run,
 )
-from poise.learn.losses import clipped_surrogate
+from poise.learn.networks import gaussian_kl, gaussian_log_prob
+from poise.learn.ppo import clipped_surrogate
 from poise.learn.rollout import Episodes, collect
-from poise.nets import gaussian_kl, gaussian_log_prob
 
 TOY = PPOConfig(
     std=0.3,

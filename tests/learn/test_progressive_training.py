@@ -31,7 +31,7 @@ from poise.learn import (
     primitive,
     run,
 )
-from poise.learn.progressive import count, primitive_log_std
+from poise.learn.primitives import count, primitive_log_std
 
 TOY = PPOConfig(std=0.3, horizon=12, epochs=2, policy_hidden=(16,), value_hidden=(16,), minibatch=128)
 OBS = torch.rand(50, 4, generator=torch.Generator().manual_seed(8)) * 2 - 1

@@ -9,8 +9,9 @@ import torch
 from toy_point_env import PointEnv
 
 from poise.errors import PoiseError
-from poise.learn import PPOConfig, Trainer, threaded_update
-from poise.nets import RunningNorm
+from poise.learn import PPOConfig, Trainer
+from poise.learn import parallel as threaded_update
+from poise.learn.networks import RunningNorm
 
 SMALL = PPOConfig(std=0.3, horizon=24, epochs=1, policy_hidden=(8,), value_hidden=(8,), minibatch=256)
 

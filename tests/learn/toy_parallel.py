@@ -14,8 +14,8 @@ from toy_point_env import PointEnv
 import poise.learn.rollout
 from poise.errors import PoiseError
 from poise.learn import PPOConfig, Step, Trainer, Until, run
+from poise.learn.networks import GaussianPolicy
 from poise.learn.parallel import ALONE, Comm, joined, rank_seed
-from poise.nets import GaussianPolicy
 
 torch.set_num_threads(1)
 TOY = PPOConfig(

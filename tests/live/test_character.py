@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.recovery.clips import GetUpPlanner
 from poise.env.recovery.planner import walk_of
 from poise.jobs.open import open_run
 from poise.live.characters import EASE, PASSES_S, RETURNS, SPEEDS_UP, TRACKS, Body, Character
-from poise.spatial.directions import facing
+from poise.motion.rotations import facing
 
 RATE = 30.0
 

@@ -10,10 +10,10 @@ import pytest
 
 from poise.errors import PoiseError
 from poise.live.commands import DEPTH, MOST_BYTES, _shallow, command, parse, turned
-from poise.live.page.guard import ALL, BURST, EACH, Bucket, Guard
-from poise.live.sources.stream import JsonStream
+from poise.live.sockets import ALL, BURST, EACH, Bucket, Guard
+from poise.live.sources import JsonStream
 from poise.live.stream import PEOPLE, WAIT, Inbox
-from poise.spatial import quat_rotate
+from poise.motion.rotations import quat_rotate
 
 NAMES = ["hips", "spine"]
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
-from poise.live.config import LiveConfig
+from poise.live.commands import LiveConfig
 from poise.live.session import Live, generator_for
-from poise.live.sources.file import Loop, packet_of
+from poise.live.sources import Loop, packet_of
 from poise.live.stream import Packet
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from test_docs import WALK
 
 STEP = 1 / 30

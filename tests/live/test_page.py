@@ -21,14 +21,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live.commands import MOST_BYTES
-from poise.live.config import LiveConfig
-from poise.live.page.guard import A_SECOND, EACH, Guard
+from poise.live.commands import MOST_BYTES, LiveConfig
 from poise.live.page.server import HEAD, PAGES, PageServer, as_json, packed
 from poise.live.session import Session, Wanted
+from poise.live.sockets import A_SECOND, EACH, Guard
 from poise.live.stream import Inbox
-from poise.motion import read_clip
 from test_docs import WALK
 
 

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.kin import clip_to_qpos
-from poise.kin.retarget.passage import Passage
-from poise.kin.retarget.standing import World
+from poise.kinematics import clip_to_qpos
+from poise.kinematics.retarget.passage import Passage
+from poise.kinematics.retarget.standing import World
 from poise.live import quats as q
 from poise.live.passage import FramePassage, Hinges, local_of, world_of
-from poise.motion import Clip, read_clip
-from poise.spatial import quat_mul, quat_rotate, quat_to_matrix, slerp
+from poise.motion import Clip
+from poise.motion.rotations import quat_mul, quat_rotate, quat_to_matrix, slerp
 from test_docs import WALK
 
 

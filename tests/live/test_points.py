@@ -14,19 +14,20 @@ import numpy as np
 import pytest
 import torch
 
-from poise.env.goals import StreamGoal
+from poise.env.stream import StreamGoal
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live import quats as q
 from poise.live.characters import TRACKS
-from poise.live.config import LiveConfig
+from poise.live.commands import LiveConfig
 from poise.live.passage import world_of
 from poise.live.points import PointFit
 from poise.live.session import Live
-from poise.live.sources.sockets import StreamDoor
-from poise.live.sources.stream import Frame, JsonStream
+from poise.live.sockets import StreamDoor
+from poise.live.sources import Frame, JsonStream
 from poise.live.stream import Inbox, Packet
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from test_docs import ROOT, WALK
 
 STEP = 1 / 30

@@ -10,7 +10,7 @@ import numpy as np
 
 from poise.live.commands import COMMANDS, command, parse
 from poise.live.page.server import as_json
-from poise.live.sources.stream import Frame, JsonStream
+from poise.live.sources import Frame, JsonStream
 from poise.live.stream import Inbox
 from test_docs import ROOT
 

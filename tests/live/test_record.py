@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.kin import clip_to_qpos
-from poise.live.sinks.record import Recorder
-from poise.motion import read_clip
+from poise.kinematics import clip_to_qpos
+from poise.live.record import Recorder
 
 
 def recorder(path: Path, count: int = 1) -> Recorder:

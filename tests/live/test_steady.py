@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.kin.fading import LATE_S
+from poise.kinematics.stream_noise import LATE_S
 from poise.live import quats as q
 from poise.live.passage import world_of
 from poise.live.people import Person, Steady
 from poise.live.points import PointFit
 from poise.live.session import _of_tremble
-from poise.live.sources.file import Loop
-from poise.live.sources.stream import Frame
+from poise.live.sources import Frame, Loop
 from poise.live.stream import Inbox, JitterBuffer, Packet, Tremble, margin
-from poise.motion import Clip, Skeleton, read_clip
+from poise.motion import Clip, Skeleton
 from test_docs import WALK
 
 STEP = 1 / 30

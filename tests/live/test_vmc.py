@@ -9,17 +9,34 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.live import quats as q
-from poise.live.config import LiveConfig
+from poise.live.commands import LiveConfig
 from poise.live.passage import world_of
 from poise.live.people import OntoBody
 from poise.live.session import Live
-from poise.live.sinks.vmc import OwnPuppet, Puppet, VmcSink, datagram
-from poise.live.sources.vmc import MESSAGES, Avatar, Message, VmcSource, bundled, encoded, messages
 from poise.live.stream import Inbox
-from poise.live.vrm import NEEDED, from_unity, skeleton_of, standard, t_pose, to_unity
-from poise.motion import Clip, Skeleton, read_clip
+from poise.live.vmc import (
+    MESSAGES,
+    NEEDED,
+    Avatar,
+    Message,
+    OwnPuppet,
+    Puppet,
+    VmcSink,
+    VmcSource,
+    bundled,
+    datagram,
+    encoded,
+    from_unity,
+    messages,
+    skeleton_of,
+    standard,
+    t_pose,
+    to_unity,
+)
+from poise.motion import Clip, Skeleton
 from test_docs import WALK
 
 
@@ -42,7 +59,7 @@ def body_of(bones: list[Message]) -> tuple[Skeleton, np.ndarray, np.ndarray]:
 
 def on_vrm() -> Clip:
     """The embedded walk on a VRM model."""
-    from poise.kin import retarget
+    from poise.kinematics import retarget
 
     return retarget(read_clip(WALK), t_pose(standard()))[0]
 

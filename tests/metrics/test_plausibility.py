@@ -26,7 +26,7 @@ from poise.metrics import (
     uhc_penetration,
     uhc_skate,
 )
-from poise.spatial import axis_angle_to_quat
+from poise.motion.rotations import axis_angle_to_quat
 
 FPS = 30.0
 

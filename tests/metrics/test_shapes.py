@@ -9,7 +9,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.metrics import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
-from poise.spatial import normalize, quat_rotate
+from poise.motion.rotations import normalize, quat_rotate
 
 SIZE = {
     "sphere": (0.1, 0.0, 0.0),

@@ -19,7 +19,7 @@ from poise.metrics import (
     success,
     velocity_error,
 )
-from poise.spatial import normalize, quat_rotate
+from poise.motion.rotations import normalize, quat_rotate
 
 SHAPES = [(4, 2), (7, 5), (3, 6, 4), (2, 3, 5, 3)]
 DTYPES = [torch.float32, torch.float64]

@@ -12,7 +12,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion import Clip, ClipLibrary, Skeleton
-from poise.spatial import euler_to_quat
+from poise.motion.rotations import euler_to_quat
 from toy_human import human, swing
 
 

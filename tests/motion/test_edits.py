@@ -9,7 +9,7 @@ import torch
 from poise.errors import PoiseError
 from poise.metrics import jerk
 from poise.motion import Clip, ground_shift, resample, shifted, trim
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 from toy_human import swing
 
 

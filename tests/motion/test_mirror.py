@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.mirror import joined, mirrored, mirrored_clip, other_sides
+from poise.motion.windows import joined, mirrored, mirrored_clip, other_sides
 from toy_human import swing
 from toy_windows import bank
 

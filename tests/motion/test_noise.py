@@ -9,10 +9,12 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.motion import read_clip, resample
-from poise.motion.io.points.raw import assemble_points
-from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import ReadOptions
+from poise.formats import read_clip
+from poise.formats.point_noise import smooth
+from poise.formats.point_raw import assemble_points
+from poise.formats.point_tables import trc_points
+from poise.formats.raw import ReadOptions
+from poise.motion import resample
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import (
     TRIANGULATED,
@@ -27,17 +29,18 @@ from poise.motion.noise import (
     SwapSides,
     WrongDepth,
     hold_missing,
+    last_seen,
     perturb_clip,
     perturb_points,
     perturb_positions,
     robustness_levels,
     scaled,
     side_pairs,
+    smooth_path,
+    spell_mask,
+    wandering_path,
 )
-from poise.motion.noise.base import smooth_path, spell_mask, wandering_path
-from poise.motion.noise.kinds import last_seen
-from poise.motion.points.clean import smooth
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 from toy_human import human, swing
 
 KINDS = (Jitter, Outliers, Drift, WrongDepth, Dropouts, FrameLoss, SwapSides, Latency)

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from poise.errors import PoiseError
-from poise.motion import Skeleton, find_roles, read_clip
+from poise.formats import read_clip
+from poise.motion import Skeleton, find_roles
 from poise.motion.role_words import name_words
 from poise.motion.roles import check_role, split_role
 

@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.motion import Clip, Skeleton, read_clip
+from poise.formats import read_clip
+from poise.motion import Clip, Skeleton
+from poise.motion.rotations import forward_kinematics, quat_rotate
 from poise.motion.windows import (
     centred,
     cut,
@@ -23,7 +25,6 @@ from poise.motion.windows import (
     window_starts,
     without_still_root,
 )
-from poise.spatial import forward_kinematics, quat_rotate
 from toy_human import human, swing
 
 

@@ -9,8 +9,14 @@ from scipy.optimize import nnls
 
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.plan.clearance import ClearanceRule, TouchPoints, clearance
-from poise.plan.inverse_dynamics import ContactRule, inverse_dynamics, step_midpoints
+from poise.plan.expert import (
+    ClearanceRule,
+    ContactRule,
+    TouchPoints,
+    clearance,
+    inverse_dynamics,
+    step_midpoints,
+)
 from toy_human import human
 
 G = 9.81

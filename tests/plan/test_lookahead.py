@@ -9,17 +9,17 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.goals import StreamGoal
+from poise.env.stream import StreamGoal
 from poise.errors import PoiseError
-from poise.eval import run_episodes
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.metrics.shapes import BOX, Shapes
 from poise.plan import Lookahead, LookaheadConfig
-from poise.plan.prices import CALM, Roughness
+from poise.plan.lookahead import CALM, Roughness
 from poise.recipes.imitation import Imitation
+from poise.score import run_episodes
 from toy_policy import toy_run, walk
 
 FEW = LookaheadConfig(candidates=16, horizon=6, hold_steps=3)

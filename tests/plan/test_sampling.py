@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.searching import look_for, replay
+from poise.jobs.track.recovering import look_for, replay
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
-from poise.motion import read_clip
 from poise.plan import SamplingConfig
 from toy_policy import toy_run, walk
 

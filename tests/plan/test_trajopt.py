@@ -13,7 +13,7 @@ from poise.env import ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.metrics import mpjpe_global
 from poise.plan import LqrTeacher, TrajectoryOptimizer, TrajOptConfig
-from poise.plan.shooting import segments
+from poise.plan.trajopt import segments
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
 from poise.sim import SimConfig
@@ -131,7 +131,7 @@ def test_settings_and_bodies_are_checked(make_task) -> None:
 
 def test_a_real_run_is_followed_without_help(data_dir: Path) -> None:
     """Inverse dynamics alone, without help, loses it in the first second."""
-    from poise.motion.io import read_clip
+    from poise.formats import read_clip
 
     clip = read_clip(data_dir / "deepmimic_txt/humanoid3d_run.txt")
     imitation = build(clip, ResidualForce(method="deepmimic"))

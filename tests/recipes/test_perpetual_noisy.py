@@ -14,8 +14,9 @@ from poise.jobs.perpetual.run import begin, resume, train
 from poise.learn import PolicyBundle, Until
 from poise.motion.noise import VIDEO, perturb_clip, scaled
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual.shapes import BodyShapes
+from poise.recipes.perpetual import build
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.shapes import BodyShapes
 from toy_library import PLAIN, library, tiny
 
 NOISY = {"noise": (0.5,), "action": "additive"}

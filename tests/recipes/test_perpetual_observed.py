@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv
-from poise.env.goals import StreamGoal
-from poise.env.terms.evaluate import seen_by
+from poise.env.evaluate import seen_by
+from poise.env.stream import StreamGoal
 from poise.errors import PoiseError
 from poise.learn import PPOConfig
+from poise.motion.rotations import axis_angle_to_quat, lateral_heading, quat_mul
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual.config import config_of
+from poise.recipes.perpetual import build
+from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.settings import to_data
 from poise.sim import make_backend
-from poise.spatial import axis_angle_to_quat, lateral_heading, quat_mul
 from toy_library import PLAIN, library, tiny
 
 HERE = torch.tensor([0, 1, 2, 2])

@@ -10,23 +10,20 @@ import pytest
 import torch
 
 from poise.body import make_humanoid
-from poise.env.body_assignment import BodyAssignment, differing
-from poise.env.terms import phc_obs
+from poise.env import observations as obs
+from poise.env.plugins import BodyAssignment
+from poise.env.reference import differing
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.kin import Kinematics, retarget
+from poise.kinematics import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
-from poise.motion import ClipLibrary, read_clip, resample
+from poise.motion import ClipLibrary, resample
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual.shapes import (
-    GROUPS,
-    BodyShapes,
-    scaled_skeleton,
-    scaled_table,
-    shaped,
-)
+from poise.recipes.perpetual import build, task
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.shapes import GROUPS, BodyShapes, scaled_skeleton, scaled_table, shaped
 from poise.sim import CpuBackend, alone
 from toy_library import library, tiny
 
@@ -127,12 +124,12 @@ def test_references_stand_on_the_floor_of_their_bodies(imitation: Imitation) -> 
 
 def test_the_observation_tells_the_bodies_apart(imitation: Imitation) -> None:
     env = imitation.env(9, threads=1, auto_reset=False)
-    at = phc_obs.self_state(env._frame()).shape[1]
+    at = obs.self_state(env._frame()).shape[1]
     width = 2 * len(imitation.humanoid.bodies) - 1
     clip = torch.arange(9)
     seen = env.reset_to(clip, torch.zeros_like(clip))[:, at : at + width]
     for row, k in zip(seen, imitation.reference.body.tolist(), strict=True):
-        assert torch.equal(row, phc_obs.shape_of(imitation.reference.bodies[k]))
+        assert torch.equal(row, obs.shape_of(imitation.reference.bodies[k]))
     assert len({tuple(row.tolist()) for row in seen}) == 3
     # Also in what a step gives, through the recorded terms.
     after = env.step(torch.zeros(9, env.num_actions)).final_obs[:, at : at + width]

@@ -10,16 +10,17 @@ import torch
 
 from poise.body import BodyConfig
 from poise.control import ExplicitResidual, ImplicitResidual, SuccessHelp
-from poise.env.terms import reward
+from poise.env import rewards as reward
 from poise.errors import PoiseError
-from poise.eval import Nothing, run_episodes, start_frames
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate
-from poise.kin import without_noise
+from poise.kinematics import without_noise
 from poise.learn import load_checkpoint, save_checkpoint
-from poise.motion import ClipLibrary, read_clip
+from poise.motion import ClipLibrary
 from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import config_of, most_help, schedule, task
+from poise.score import Nothing, run_episodes, start_frames
 from poise.sim.mjcf import write_mjcf
 from toy_human import swing, trembling
 

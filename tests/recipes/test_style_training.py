@@ -11,10 +11,11 @@ import torch
 
 from poise.control import PDTargets, range_scale
 from poise.env import DoneTerm, ObsTerm
-from poise.env.terms import done, phc_obs, phc_reward
+from poise.env import observations as obs
+from poise.env import rewards as reward
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.learn import Amp, AmpConfig, PPOConfig
-from poise.motion import read_clip
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 
@@ -31,14 +32,14 @@ def walk() -> Imitation:
     with as_file(files("poise").joinpath("data/walk.bvh")) as path:
         built = build(read_clip(path), ResidualForce(num_envs=8, method="deepmimic", ppo=PPO, seed=4))
     humanoid = built.humanoid
-    apart = {"bodies": done.all_but_feet(humanoid), "grace": 1}
+    apart = {"bodies": reward.all_but_feet(humanoid), "grace": 1}
     task = replace(
         built.task,
-        obs=(ObsTerm("self", phc_obs.self_state), ObsTerm("goal", phc_obs.rotation_goal)),
-        rewards=(*phc_reward.imitation_terms("code"), phc_reward.energy_term(AMP.task_weight)),
-        dones=(DoneTerm("any_body_too_far", done.any_body_too_far, apart),),
+        obs=(ObsTerm("self", obs.self_state), ObsTerm("goal", obs.rotation_goal)),
+        rewards=(*reward.imitation_terms("code"), reward.energy_term(AMP.task_weight)),
+        dones=(DoneTerm("any_body_too_far", reward.any_body_too_far, apart),),
         pd=PDTargets("absolute", range_scale(torch.tensor(humanoid.model.jnt_range[1:]))),
-        style=phc_obs.style_terms(humanoid),
+        style=obs.style_terms(humanoid),
         horizon=20,
     )
     return replace(built, task=task)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from poise.body import BodyConfig, Humanoid
-from poise.kin import fit_humanoid
+from poise.kinematics import fit_humanoid
 from poise.sim import SimConfig, alone
 from poise.sim.mjcf import mjcf_of, write_mjcf
 from toy_policy import walk

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from poise.body import presets
+from poise.body import table as presets
 from poise.body.parts import Anatomy, Part, find_anatomy
-from poise.body.presets import PARTS, Strength, default_mass, length_factor
 from poise.body.shapes import Ruler, geoms_of
-from poise.body.table import BodyRow, BodyTable, floats
+from poise.body.table import PARTS, BodyRow, BodyTable, Strength, default_mass, floats, length_factor
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
-from poise.spatial import euler_to_quat, quat_mul, quat_rotate
+from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 

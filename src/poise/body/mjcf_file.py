@@ -1,4 +1,4 @@
-"""What MuJoCo compiles of an MJCF file; a script of its own, see `motion.io.limited`."""
+"""What MuJoCo compiles of an MJCF file; a script of its own, see `formats.limited`."""
 
 from __future__ import annotations
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from poise.body import presets
+from poise.body import table as presets
 from poise.body.parts import Anatomy, Part
-from poise.body.presets import PARTS
-from poise.body.table import Geom
+from poise.body.table import PARTS, Geom
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
-from poise.spatial import matrix_to_quat, quat_mul, quat_rotate_inv
+from poise.motion.rotations import matrix_to_quat, quat_mul, quat_rotate_inv
 
 Links = Mapping[int, tuple[int, np.ndarray, np.ndarray]]
 _UP = np.array([0.0, 0.0, 1.0])

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import table
+from poise.cli.console import Answer, table
 from poise.cli.options import Body, Flag, Reading
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
@@ -44,7 +43,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             raise PoiseError("a body is written as MJCF, in a file .xml", out, "Give -o FILE.xml")
         own = () if options.body.body is None else (options.body.body,)
         may_write(out, options.force, options.clip, *own)
-    from poise.kin import fit_humanoid
+    from poise.kinematics import fit_humanoid
     from poise.sim.mjcf import write_mjcf
 
     clip = options.reading.read(options.clip)

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.answer import LOST, Answer
-from poise.cli.console import print_card, say, table, tell
+from poise.cli.console import LOST, Answer, print_card, say, table, tell
 from poise.cli.inbetween import frames_of
-from poise.cli.options import Flag, InPlace, Reading, check_range
-from poise.cli.output import places
-from poise.cli.progress import staged, working
+from poise.cli.options import Flag, InPlace, Reading, check_range, places
+from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
@@ -109,10 +107,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
     from poise.plan import LookaheadConfig
-    from poise.synth.gaps import check_keyframes
-    from poise.synth.sparse import partials_of, times_of
+    from poise.synthesis.filler import check_keyframes
+    from poise.synthesis.inbetween import partials_of, times_of
 
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     config = TrackConfig(
@@ -172,10 +170,10 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
     if o.partial or o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
         raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
+    from poise.formats import check_writable, names_file, write_clip
     from poise.jobs.inbetween.fill import inbetween
-    from poise.motion.io import check_writable, names_file, write_clip
-    from poise.synth.gaps import check_keyframes
-    from poise.synth.sparse import timed, times_of
+    from poise.synthesis.filler import check_keyframes
+    from poise.synthesis.inbetween import timed, times_of
 
     path = o.out if names_file(o.out) and not o.out.is_dir() else o.out / f"filled{o.clip.suffix}"
     check_writable(path)

@@ -9,10 +9,8 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say
-from poise.cli.folder import each
-from poise.cli.options import Flag, Reading
+from poise.cli.console import Answer, say
+from poise.cli.options import Flag, Reading, each
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_write
 
@@ -42,8 +40,8 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, resamples where asked to, writes."""
+    from poise.formats import check_writable, write_clip
     from poise.motion import resample, trim
-    from poise.motion.io import check_writable, write_clip
 
     target = target_of(options)
     if options.source.is_dir():

@@ -10,8 +10,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say
+from poise.cli.console import Answer, say
 from poise.cli.imitate import Options as Whole
 from poise.cli.imitate import run as run_whole
 from poise.cli.options import Flag, Training

@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from poise.cli.answer import INTERRUPTED, LOST, Answer
-from poise.cli.console import say, table
-from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import places
-from poise.cli.progress import staged, working
+from poise.cli.console import INTERRUPTED, LOST, Answer, say, table
+from poise.cli.options import Flag, Reading, check_range, places
+from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
@@ -90,8 +88,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     read = () if o.seed_clip is None else (o.seed_clip,)
     may_deliver(out, motion, o.force, *read)
     targets = () if o.steer is None else targets_of(o.steer)
-    from poise.jobs.endless.config import Dream
     from poise.jobs.endless.dreaming import dream, names_of
+    from poise.jobs.endless.dreamt import Dream
     from poise.jobs.endless.model import load_generator
     from poise.jobs.open import open_run
     from poise.plan import LookaheadConfig

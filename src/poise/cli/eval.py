@@ -9,10 +9,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import print_card
+from poise.cli.console import Answer, print_card
 from poise.cli.options import Device, Flag, Rule, check_device
-from poise.cli.progress import working
+from poise.cli.training import working
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 

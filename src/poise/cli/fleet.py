@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from poise.cli.answer import INTERRUPTED, Answer
-from poise.cli.console import say, table, tell
-from poise.cli.folder import clips_in
-from poise.cli.options import Flag
+from poise.cli.console import INTERRUPTED, Answer, say, table, tell
+from poise.cli.options import Flag, clips_in
 from poise.cli.parse import parse
-from poise.cli.progress import clock
+from poise.cli.training import clock
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 from poise.machine import cores

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say, tell
+from poise.cli.console import Answer, say, tell
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.progress import left, showing
+from poise.cli.training import left, showing
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 
@@ -55,9 +54,9 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, fills, writes."""
+    from poise.formats import check_writable, write_clip
     from poise.jobs.inbetween.fill import inbetween
-    from poise.motion.io import check_writable, write_clip
-    from poise.synth.gaps import check_keyframes
+    from poise.synthesis.filler import check_keyframes
 
     o = options
     keys = frames_of(o.keyframes)
@@ -104,7 +103,7 @@ def draw(clip: Clip, made: Sequence[Clip], keys: Sequence[int], path: Path) -> N
     """Up to four of the clips made, at 13 moments from the first keyframe to the last."""
     import numpy as np
 
-    from poise.view import PoseRow, pose_rows
+    from poise.score.report import PoseRow, pose_rows
 
     frames = np.unique(np.linspace(keys[0], keys[-1], 13).round().astype(int)).tolist()
     ghost = clip.positions()

@@ -9,10 +9,8 @@ from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import notes, say, table
-from poise.cli.folder import each
-from poise.cli.options import Flag, Reading
+from poise.cli.console import Answer, notes, say, table
+from poise.cli.options import Flag, Reading, each
 from poise.errors import PoiseError
 
 #: The keys of a clip in the result, which programs rely on.
@@ -45,7 +43,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError("no clip was given", hint="Write poise info CLIP")
     if any(path.is_dir() for path in options.clips):
         return each("info", options.clips, None, lambda p, _: run(replace(options, clips=(p,)), argv))
-    from poise.kin import find_faults, find_guesses
+    from poise.kinematics import find_faults, find_guesses
     from poise.motion.info import describe
 
     clips = [options.reading.read(path) for path in options.clips]

@@ -14,10 +14,9 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say, tell
+from poise.cli.console import Answer, say, tell
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.progress import working
+from poise.cli.training import working
 from poise.errors import PoiseError
 
 
@@ -82,10 +81,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.clips and live_in:
         raise PoiseError("files and a live stream were both given", hint="Leave one of them out")
     from poise.jobs.open import open_run
-    from poise.kin.travel import find_travel, travelled
-    from poise.live.config import LiveConfig
-    from poise.live.page.guard import LOOPBACK
+    from poise.kinematics.travel import find_travel, travelled
+    from poise.live.commands import LiveConfig
     from poise.live.session import Session, Wanted
+    from poise.live.sockets import LOOPBACK
 
     with working("opening the policy"):
         paths = () if live_in else o.clips or (Path(__file__).parents[1] / "data" / "walk.bvh",)

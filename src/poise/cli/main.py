@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from poise import __version__
-from poise.cli.answer import INTERRUPTED, Answer, document, failure, inputs_of
+from poise.cli.console import INTERRUPTED, Answer, document, failure, inputs_of
 from poise.errors import PoiseError, did_you_mean
 
 #: Every verb and what it does; its module is imported only when it runs.

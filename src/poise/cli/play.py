@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from poise.cli.answer import Answer
+from poise.cli.console import Answer
 from poise.cli.options import Flag
-from poise.cli.progress import working
+from poise.cli.training import working
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.keep import may_write
 
@@ -46,7 +46,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         may_write(options.out, options.force)
     from poise.jobs.deliver import make_report
     from poise.jobs.open import open_run
-    from poise.view import write_report
+    from poise.score.report import write_report
 
     with working("simulating"):
         run = open_run(options.run)

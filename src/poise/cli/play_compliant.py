@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say, table
+from poise.cli.console import Answer, say, table
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.progress import working
+from poise.cli.training import working
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.keep import claimed, may_write
 

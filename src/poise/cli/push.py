@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import LOST, Answer
-from poise.cli.console import print_card, say
-from poise.cli.options import Flag, InPlace, Reading, check_range
-from poise.cli.output import places
-from poise.cli.progress import working
+from poise.cli.console import LOST, Answer, print_card, say
+from poise.cli.options import Flag, InPlace, Reading, check_range, places
+from poise.cli.training import working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver
 
@@ -86,7 +84,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.cli.track import follow
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, write
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
 
     config = TrackConfig(
         seed=o.seed, controller=o.controller, threads=o.threads, body=o.body, push=push,

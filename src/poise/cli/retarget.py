@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say, table
+from poise.cli.console import Answer, say, table
 from poise.cli.options import Flag, Reading
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 
 if TYPE_CHECKING:
-    from poise.kin import RetargetReport
+    from poise.kinematics import RetargetReport
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads both files, moves the motion over, writes, says what was matched and measured."""
-    from poise.kin import RetargetConfig, retarget, without_noise
-    from poise.motion.io import read_skeleton, write_clip
+    from poise.formats import read_skeleton, write_clip
+    from poise.kinematics import RetargetConfig, retarget, without_noise
 
     out = options.out
     may_write(out, options.force, options.clip, options.onto)

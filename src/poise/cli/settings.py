@@ -27,9 +27,9 @@ T = TypeVar("T")
 SOURCES = {
     "residual-force": ("recipes/residual_force.py", "ResidualForce"),
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
-    "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
+    "perpetual": ("recipes/perpetual_settings.py", "Perpetual"),
     "endless": ("jobs/endless/training.py", "Endless"),
-    "compliant": ("papers/compliant/recipe.py", "Compliant"),
+    "compliant": ("papers/compliant/training.py", "Compliant"),
 }
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.

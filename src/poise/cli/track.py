@@ -10,12 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.answer import INTERRUPTED, LOST, Answer
-from poise.cli.console import print_card, say, tell
-from poise.cli.folder import each
-from poise.cli.options import Flag, InPlace, Reading, check_range
-from poise.cli.output import places
-from poise.cli.progress import clock, showing, staged, working
+from poise.cli.console import INTERRUPTED, LOST, Answer, print_card, say, tell
+from poise.cli.options import Flag, InPlace, Reading, check_range, each, places
+from poise.cli.training import clock, showing, staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
@@ -23,7 +20,7 @@ if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress
     from poise.jobs.track import TrackConfig, Tracked
     from poise.jobs.tracker import Tracker
-    from poise.kin.supports import Support
+    from poise.kinematics.supports import Support
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
 
@@ -167,7 +164,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 
@@ -235,7 +232,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
 
 def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support, ...]:
     """What is to stand beside the motion."""
-    from poise.kin.supports import read_supports
+    from poise.kinematics.supports import read_supports
 
     if options.support is not None:
         if not options.supports:
@@ -273,7 +270,7 @@ def telling(said: list[str]) -> Callable[[str], None]:
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
-    from poise.cli.perpetual_report import times
+    from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
     from poise.learn import Until
 
@@ -316,8 +313,8 @@ def advice(options: Options, tracked: Tracked) -> str:
 
 def read(path: Path, reading: Reading) -> Clip | Keypoints:
     """The motion in a file; keypoints stay keypoints."""
-    from poise.jobs.track.points import points_of
-    from poise.motion.io.raw import ReadOptions as Stated
+    from poise.formats.raw import ReadOptions as Stated
+    from poise.jobs.track.placement import points_of
 
     clip = reading.read(path)
     if reading.ground is not None or reading.swap_sides:

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say
+from poise.cli.console import Answer, say
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
 from poise.cli.settings import SOURCES, class_of, given

@@ -5,17 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from poise.cli.answer import Answer
-from poise.cli.progress import training as progress
-from poise.cli.progress import working
-from poise.cli.training import finished, refuse_held
+from poise.cli.console import Answer
+from poise.cli.training import finished, refuse_held, working
 from poise.cli.training import stopped as interrupted
+from poise.cli.training import training as progress
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.papers.compliant.recipe import Compliant
+    from poise.papers.compliant.training import Compliant
 
 
 def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from poise.cli.answer import Answer
-from poise.cli.console import say, tell
+from poise.cli.console import Answer, say, tell
 from poise.cli.library_options import Library
-from poise.cli.progress import showing
 from poise.cli.train_inbetween import times
-from poise.cli.training import finished, refuse_held
+from poise.cli.training import finished, refuse_held, showing
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
@@ -31,10 +29,8 @@ def run(
     """
     import torch
 
-    from poise.jobs.endless.labels import read_labels
-    from poise.jobs.endless.model import GENERATOR
-    from poise.jobs.endless.run import RUN_FILE, begin
-    from poise.jobs.endless.training import train_generator
+    from poise.jobs.endless.model import GENERATOR, read_labels
+    from poise.jobs.endless.training import RUN_FILE, begin, train_generator
     from poise.jobs.open import open_run
 
     folder = library.folder("endless")

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from tyro.conf import arg
 
-from poise.cli.answer import Answer
-from poise.cli.console import say, tell
+from poise.cli.console import Answer, say, tell
 from poise.cli.library_options import Library
-from poise.cli.progress import clock, showing
 from poise.cli.settings import derived
-from poise.cli.training import finished, refuse_held
+from poise.cli.training import clock, finished, refuse_held, showing
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed

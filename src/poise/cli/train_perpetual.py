@@ -1,33 +1,124 @@
-"""`poise train perpetual`: one policy for a whole library, stage after stage without a manual step."""
+"""`poise train perpetual`: one policy for a whole library, stage after stage."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias
 
 from tyro.conf import arg
 
-from poise.cli import progress
-from poise.cli.answer import Answer
-from poise.cli.console import launched, notes, say, tell
+from poise.cli import training as progress
+from poise.cli.console import Answer, launched, notes, say, table, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Flag, Training
-from poise.cli.perpetual_report import report, shown
-from poise.cli.progress import clock
 from poise.cli.settings import class_of, configured, derived, given, stated
-from poise.cli.training import beginning, held_already, stopped
+from poise.cli.training import beginning, clock, held_already, left, showing, stopped
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
-    from poise.cli.train import Options
+    from poise.jobs.perpetual.run import PerpetualResult
+    from poise.jobs.perpetual.stage_order import Progress
+    from poise.recipes.imitation import Imitation
+    from poise.score import RecoveryCard
+
+
+#: Clips that are named in the end.
+NAMED = 10
+
+
+def report(imitation: Imitation, result: PerpetualResult, out: Path) -> Answer:
+    """What the run came to, and which clips are the hardest."""
+    if result.last is None:
+        say(f"{out} had reached its limit before; nothing was trained.")
+    else:
+        stats = result.last.stats
+        say(f"Trained {clock(stats.seconds)}, {stats.samples:,} samples, {parts(result)}")
+    r, names = result.results, imitation.library.names
+    assert r is not None
+    won, total = int(r.succeeded.sum()), len(r.clip)
+    say(f"Without help {won} of {total} clips succeed ({100 * r.rate:.1f} %), {r.error_mm:.0f} mm")
+    if result.recovery is not None:
+        say(recovered(result.recovery))
+    if hard := r.hardest(NAMED):
+        rows = []
+        for c in hard:
+            k = r.clip.tolist().index(c)
+            rows.append((names[c], f"{int(r.tracked[k])} of {int(r.frames[k])}"))
+        table(f"The hardest of {total - won} that fail", ("clip", "frames tracked"), rows)
+    figures = {"succeeded": won, "clips": total, "succ": r.rate, "error_mm": r.error_mm}
+    return Answer(figures, {"run": out})
+
+
+def recovered(card: RecoveryCard) -> str:
+    """What trials of recovery came to: "Recovery: fallen 95 % within 5 s and 99 % within 10 s; ..."."""
+    rows = []
+    for row in card.rows:
+        each = (f"{100 * x:.0f} % within {t:g} s" for x, t in zip(row.within, card.seconds, strict=True))
+        rows.append(f"{row.kind} {' and '.join(each)}")
+    return f"Recovery, {card.rows[0].trials} trials each: {'; '.join(rows)}"
+
+
+def parts(result: PerpetualResult) -> str:
+    """What was trained, in words."""
+    n = result.primitives
+    made = f"{n} primitive{'s' if n > 1 else ''}" if n else "one network"
+    return f"{made}; nothing fails any more" if result.solved else made
+
+
+def figures(p: Progress) -> str:
+    """What one iteration says: the stage, its clips, the speed."""
+    what = "trials" if p.stage.kind == "recovery" else "clips"
+    won = "" if p.succeeded is None else f"  {p.succeeded} of {p.clips} {what}"
+    helped = f"  help at most {p.help_n:.0f} N" if p.help_n else "  no help"
+    reward = p.stats.terms.get("imitation", p.stats.reward)
+    speed = f"{p.stats.samples_per_s:,.0f} samples/s"
+    return f"{p.stage.name}{won}  {speed}  imitation {reward:.3f}{helped}"
+
+
+def times(p: Progress) -> str:
+    """How far it is: "1:20, 8:40 left"."""
+    return f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)}"
+
+
+def events(p: Progress) -> None:
+    """A line for each evaluation, where another stage begins, and for what went wrong."""
+    if p.trouble:
+        tell(
+            f"Gone on from the last checkpoint with other draws, since a simulation failed: {p.trouble}"
+        )
+    if p.results is not None:
+        won, total = int(p.results.succeeded.sum()), len(p.results.clip)
+        tell(
+            f"{clock(p.stats.seconds)}  {p.stage.name}: {won} of {total} clips succeed, "
+            f"{p.results.error_mm:.0f} mm"
+        )
+    if p.recovery is not None:
+        tell(f"{clock(p.stats.seconds)}  {p.stage.name}: {recovered(p.recovery)}")
+    if p.following is not None:
+        tell(f"{clock(p.stats.seconds)}  {p.following.name} begins")
+
+
+@contextlib.contextmanager
+def shown() -> Iterator[Callable[[Progress], None]]:
+    """A bar in a terminal, a line now and then elsewhere, and `events`."""
+    with showing("training") as show:
+
+        def one(p: Progress) -> None:
+            show(p.share, f"{times(p)}  {figures(p)}")
+            events(p)
+
+        yield one
+
+
+if TYPE_CHECKING:
     from poise.jobs.tracker import Tracker
     from poise.recipes.imitation import Imitation
-    from poise.recipes.perpetual import Perpetual
+    from poise.recipes.perpetual_settings import Perpetual
 
     _Derived: TypeAlias = Any
 else:
@@ -97,7 +188,7 @@ def settings(
         default = default.taught()
     elif primitives.teacher:
         from poise.jobs.open import open_run
-        from poise.jobs.perpetual.distillation import taught_by
+        from poise.jobs.perpetual.stage_start import taught_by
 
         if primitives.going_on is not None:
             what = "--teacher POLICY is imitated by a new network, and --from goes on with one"
@@ -107,7 +198,24 @@ def settings(
     return training.settings("perpetual", default, body, values)
 
 
-def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
+class TrainOptions(Protocol):
+    """The options of `poise train`, as far as this recipe reads them."""
+
+    @property
+    def library(self) -> Library: ...
+    @property
+    def primitives(self) -> Primitives: ...
+    @property
+    def out(self) -> Path: ...
+    @property
+    def training(self) -> Training: ...
+    @property
+    def body(self) -> Body: ...
+    @property
+    def recipe_settings(self) -> Any: ...
+
+
+def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     """Refuses options that the policy decides from which training goes on; the settings in --set that it
     does not, by dotted names.
 
@@ -136,7 +244,7 @@ def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
     return more
 
 
-def goes_on(o: Options, config: Perpetual) -> tuple[Tracker, Perpetual]:
+def goes_on(o: TrainOptions, config: Perpetual) -> tuple[Tracker, Perpetual]:
     """The policy of --from, and the settings of a run that goes on from it.
 
     config: what the command line states without it.
@@ -159,7 +267,7 @@ def goes_on(o: Options, config: Perpetual) -> tuple[Tracker, Perpetual]:
     return tracker, configured(config, more)
 
 
-def run(o: Options, config: Perpetual, again: str) -> Answer:
+def run(o: TrainOptions, config: Perpetual, again: str) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
     library, primitives, out, training = o.library, o.primitives, o.out, o.training
     library.folder("perpetual")
@@ -183,7 +291,7 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
     t, result, trained = training, None, None
     # A run that was killed before its first checkpoint begins as if it had not been begun.
     if tracker is not None and not (out / LATEST).exists():
-        from poise.jobs.perpetual.distillation import distilled
+        from poise.jobs.perpetual.stage_start import distilled
         from poise.jobs.warm_start import widened
 
         if primitives.going_on is None:

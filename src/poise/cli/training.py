@@ -1,36 +1,137 @@
-"""What `imitate` and `train` share: check, read, build, train, what is said meanwhile, and
-the way to go on.
-
-Under `torchrun` several processes do one job: rank 0 reads, writes and prints, the others open the
-run folder that it made and train with it.
-"""
+"""What `imitate` and `train` share: check, read, build, train, the learning curve meanwhile."""
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import shlex
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from poise.cli import progress
-from poise.cli.answer import INTERRUPTED, Answer
-from poise.cli.console import launched, notes, say, tell
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
+
+from poise.cli.console import INTERRUPTED, Answer, err, launched, notes, say, tell
 from poise.cli.options import InPlace, Reading, Training
-from poise.cli.progress import clock, left
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
-    from poise.eval import ScoreCard
     from poise.jobs.warm_start import TrainingCallbacks
-    from poise.learn import CloneStats, PolicyBundle, RunResult, WarmStart
+    from poise.learn import CloneStats, IterationStats, PolicyBundle, RunResult, Until, WarmStart
     from poise.learn.parallel import Comm
     from poise.motion import ClipLibrary
     from poise.plan import TrajOptStats
     from poise.recipes import ResidualForce
     from poise.recipes.imitation import Imitation
+    from poise.score import ScoreCard
+
+
+#: Seconds between two lines where there is no terminal.
+EVERY_S = 30.0
+
+
+def clock(seconds: float) -> str:
+    """Minutes and seconds, with hours where there are any: "4:05"."""
+    whole = max(0, round(seconds))
+    hours, rest = divmod(whole, 3600)
+    return (f"{hours}:{rest // 60:02d}" if hours else f"{rest // 60}") + f":{rest % 60:02d}"
+
+
+def share_done(stats: IterationStats, until: Until) -> float:
+    """How much of the nearest limit is used up, 0 to 1."""
+    return until.share(stats.iteration, stats.samples, stats.seconds)
+
+
+def left(seconds: float, share: float) -> str:
+    """What is left of work of which a share took so many seconds: "8:40 left"."""
+    return f"{clock(seconds * (1 / share - 1))} left" if share else "? left"
+
+
+def figures(stats: IterationStats) -> str:
+    """What one iteration says about the learning."""
+    reward = stats.terms.get("imitation", stats.reward)
+    # Nothing is known about episodes before the first one has ended.
+    ended = (
+        ""
+        if math.isnan(stats.episode_length)
+        else (f"  episode {stats.episode_length:.0f} steps  failures {100 * stats.failure_rate:.0f} %")
+    )
+    limit, force = stats.terms.get("help/limit_n"), stats.terms.get("help/force_n")
+    helped = "  no help" if limit == 0 else f"  help at most {limit or 0:.0f} N"
+    if limit is None:
+        helped = "" if force is None else f"  help {force:.0f} N, without a limit"
+    return f"{stats.samples_per_s:,.0f} samples/s  imitation {reward:.3f}{ended}{helped}"
+
+
+def times(stats: IterationStats, until: Until) -> str:
+    """Elapsed, limit and what is left: "1:20 of 10:00, 8:40 left"."""
+    done = share_done(stats, until)
+    if until.iterations and stats.iteration / until.iterations == done:
+        return f"iteration {stats.iteration} of {until.iterations}, {left(stats.seconds, done)}"
+    limit = f" of {clock(60 * until.minutes)}" if until.minutes else ""
+    return f"{clock(stats.seconds)}{limit}, {left(stats.seconds, done)}"
+
+
+@contextlib.contextmanager
+def showing(title: str, at_once: bool = True) -> Iterator[Callable[[float, str], None]]:
+    """Gives the function that shows a share, 0 to 1, and a text: a bar in a terminal, elsewhere a line
+    every `EVERY_S`, and with `at_once` also at the beginning and at the end."""
+    console, last = err(), [float("-inf") if at_once else time.monotonic()]
+    if not console.is_terminal:
+
+        def line(done: float, what: str) -> None:
+            if time.monotonic() - last[0] >= EVERY_S or (at_once and done >= 1):
+                last[0] = time.monotonic()
+                tell(what)
+
+        yield line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=1.0, what="")
+        yield lambda done, what: bar.update(task, completed=done, what=what)
+
+
+@contextlib.contextmanager
+def training(until: Until) -> Iterator[Callable[[IterationStats], None]]:
+    """Gives the function that shows one iteration."""
+    with showing("training") as show:
+        yield lambda stats: show(share_done(stats, until), f"{times(stats, until)}  {figures(stats)}")
+
+
+@contextlib.contextmanager
+def working(what: str) -> Iterator[None]:
+    """A spinner in a terminal while something takes seconds, elsewhere a line."""
+    console = err()
+    if not console.is_terminal:
+        tell(what, "dim")
+        yield
+        return
+    with console.status(Text(what)):
+        yield
+
+
+def staged(shown: contextlib.ExitStack) -> Callable[[str, int, int], None]:
+    """Told what is done, and how much of how much, it shows a bar for each, with the time left; what
+    `shown` holds ends with the first."""
+    began, now = time.monotonic(), ""
+    bar: Callable[[float, str], None] | None = None
+
+    def show(what: str, done: int, of: int) -> None:
+        nonlocal began, now, bar
+        if bar is None or what != now:
+            shown.close()
+            began, now = time.monotonic(), what
+            bar = shown.enter_context(showing(what))
+        share = done / max(of, 1)
+        bar(share, f"{what}, {100 * share:.0f} % done, {left(time.monotonic() - began, share)}")
+
+    return show
 
 
 @dataclass(frozen=True)
@@ -70,7 +171,7 @@ class Job:
         library = self.read()
         say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
         notes([n for clip in library for n in clip.skeleton.source.notes])
-        with claimed(self.out), claimed(self.run), progress.working("making the body"):
+        with claimed(self.out), claimed(self.run), working("making the body"):
             imitation = begin(self.run, library, self.config, self.training.device)
         if self.training.resume and not held:
             tell(f"There was no run in {self.run}; a new one starts.")
@@ -79,7 +180,7 @@ class Job:
 
     def read(self) -> ClipLibrary:
         """All clips, each with a name of its own."""
-        from poise.jobs.track.in_place import with_travel
+        from poise.jobs.track.rates import with_travel
         from poise.motion import ClipLibrary
 
         seen: dict[str, int] = {}
@@ -103,7 +204,7 @@ class Job:
         if self.training.device != "cpu":
             tell("The first steps on a new GPU compile its kernels, which takes minutes once.", "dim")
         try:
-            with progress.training(until) as show:
+            with training(until) as show:
                 t, begins = self.training, beginning(first)
                 return train(
                     imitation, self.run, until, show, t.threads,

@@ -2,8 +2,15 @@
 
 from poise.control.compliance import Compliance, Stiffness
 from poise.control.pd import PDTargets, range_scale, stable_pd_torque
-from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
-from poise.control.schedule import HelpSchedule, LinearHelp, SuccessHelp
+from poise.control.residual import (
+    ExplicitResidual,
+    HelpSchedule,
+    ImplicitResidual,
+    LinearHelp,
+    Residual,
+    SuccessHelp,
+    Wrench,
+)
 
 __all__ = [
     "Compliance",

@@ -1,9 +1,9 @@
 """Environments: imitation as a list of terms over many simulated worlds."""
 
 from poise.env.env import ImitationEnv
+from poise.env.faces import GymEnv, GymVectorEnv
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
-from poise.env.gym import GymEnv, GymVectorEnv
-from poise.env.recovery.config import Recovery
+from poise.env.recovery.clock import Recovery
 from poise.env.reference import Reference
 from poise.env.task import Acts, EnvStep, TaskConfig
 

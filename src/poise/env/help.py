@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.control import HelpSchedule
-from poise.env.goals.goal import Group
+from poise.env.goal import Group
 from poise.env.plugins import Ended, Plugin
 from poise.errors import PoiseError
 

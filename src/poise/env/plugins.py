@@ -5,7 +5,7 @@ An environment holds a tuple of them and names none. A plug-in overrides the hoo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from poise.body import Humanoid
 from poise.env.bins import Outcomes
 from poise.env.frame import Frame, Observable
-from poise.sim import Drive
+from poise.env.observations import shape_of
+from poise.env.reference import Start, differing
+from poise.sim import Backend, Drive, alone
 
 if TYPE_CHECKING:
-    from poise.env.goals import Goal
-
-#: Coordinates of episodes' starts: qpos `(n, nq)` and qvel `(n, nv)`, float64.
-Start = tuple[Tensor, Tensor]
+    from poise.env.goal import Goal
 
 
 class Felt(NamedTuple):
@@ -73,7 +73,7 @@ class Plugin:
 
     @property
     def observables(self) -> Mapping[str, Observable]:
-        """Observables by name; they come before those of `env.observables`."""
+        """Observables by name; they come before those of `env.frame`."""
         return {}
 
     def sources(self) -> Mapping[str, Tensor]:
@@ -198,3 +198,96 @@ def ends_of(
         failed, done = plugin.ends(frame, failed, done)
     terminated = failed | done
     return failed, terminated, (frame.source("age") >= horizon) & ~terminated
+
+
+#: Control steps of all worlds after which failures are counted up, and what is then left of older ones.
+EVERY, KEPT = 64, 0.9
+#: Outcomes without a failure that every bin is taken to have had.
+PRIOR = 5.0
+#: With which odds a bin is practised that always fails; one that fails half of the time has 0.3.
+ALWAYS_FAILS = 0.1
+
+
+class AdaptiveSampling(Plugin):
+    """How often episodes failed in each of G motion bins lately: those in which they fail are begun in
+    more often.
+
+    Attributes:
+        odds: `(G,)` float64 on the CPU, with which bins are to be practised: f (1 + `ALWAYS_FAILS` - f)
+            of the share f that failed, most where about every second episode fails. Bins that always
+            fail are neither dwelled on nor given up.
+    """
+
+    def __init__(self, bins: int, device: torch.device | str = "cpu"):
+        self._counts = torch.zeros(2, bins, dtype=torch.float64, device=device)
+        self.steps = 0
+        self._rate()
+
+    def count(self, ended: Ended) -> None:
+        self.add(ended.bins)
+
+    def add(self, seen: Outcomes) -> None:
+        """One control step of all worlds."""
+        # Zeros and ones are added, so that their order, which a GPU does not keep, makes no difference.
+        self._counts.index_add_(1, seen.bin, torch.stack((seen.ended, seen.failed)))
+        self.steps += 1
+        if self.steps % EVERY == 0:
+            self._rate()
+            self._counts *= KEPT
+
+    def _rate(self) -> None:
+        ended, failed = self._counts.cpu()
+        share = failed / (ended + PRIOR)
+        self.odds = share * (1.0 + ALWAYS_FAILS - share)
+
+    def state(self) -> dict[str, Tensor]:
+        """Under "hardness", float64 `(1 + 3 G)`."""
+        steps = torch.tensor([self.steps]).double()
+        return {"hardness": torch.cat((steps, self.odds, self._counts.cpu().flatten()))}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from `state()`; from that of other bins as if nothing were known."""
+        bins, saved = self._counts.shape[1], state.get("hardness")
+        if saved is None or len(saved) != 1 + 3 * bins:
+            return
+        self.steps, own = int(saved[0]), saved[1:].cpu().reshape(3, bins)
+        self.odds = own[0].clone()
+        self._counts.copy_(own[1:])
+
+
+class BodyAssignment(Plugin):
+    """The bodies of a backend's worlds, as a plug-in.
+
+    Attributes:
+        body: `(N,)`, which body each world has.
+        sizes: `(S, K)` float32 of the bodies, see `shape_of`.
+
+    Args:
+        backend: its model is that of the first body, which all worlds have at first.
+        humanoids: S bodies.
+    """
+
+    def __init__(self, backend: Backend, humanoids: Sequence[Humanoid]):
+        fields = differing([backend.model, *(alone(h) for h in humanoids[1:])])
+        self._live = {name: backend.expand(name) for name in fields}
+        self._values = {
+            name: torch.from_numpy(fields[name]).to(live).view(len(humanoids), *live.shape[1:])
+            for name, live in self._live.items()
+        }
+        self.sizes = torch.stack([shape_of(h) for h in humanoids]).to(backend.device)
+        self.body = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
+
+    @property
+    def observables(self) -> Mapping[str, Observable]:
+        """The sizes of each character's body."""
+        return {"sizes": lambda frame: self.sizes.index_select(0, frame.place.body.long())}
+
+    def assign(self, rows: Tensor | None, body: Tensor) -> None:
+        old = self.body if rows is None else self.body[rows]
+        changed = (body != old).nonzero().squeeze(-1)
+        if not len(changed):
+            return
+        ids, new = changed if rows is None else rows[changed], body[changed]
+        self.body[ids] = new
+        for name, live in self._live.items():
+            live[ids] = self._values[name].index_select(0, new)

@@ -7,10 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from poise.env.frame import Frame, ObsTerm
-from poise.env.observables import headed
+from poise.env.evaluate import seen_by
+from poise.env.frame import Frame, ObsTerm, headed
 from poise.env.reference import Reference
-from poise.env.terms.evaluate import seen_by
 from poise.errors import PoiseError
 
 #: Features of all frames are kept up to this size; of larger libraries they are worked out when drawn.

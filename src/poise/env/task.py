@@ -1,23 +1,25 @@
-"""What a task is made of, and what one of its control steps gives."""
+"""What a task is made of, what one of its control steps gives, what an environment holds for it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from poise.control import Compliance, HelpSchedule, PDTargets, Residual, Stiffness, Wrench
 from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
-from poise.env.plugins import Plugin
-from poise.env.recovery.config import Recovery
+from poise.env.goal import ClipGoal, Goal
+from poise.env.help import HelpBudget
+from poise.env.plugins import AdaptiveSampling, BodyAssignment, Plugin
+from poise.env.recovery.clock import Recovery, RecoveryClock
+from poise.env.reference import Reference
+from poise.env.starts import Starts
+from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.sim import Backend, SimState
-
-if TYPE_CHECKING:
-    from poise.env.goals import Goal
 
 
 class Acts(Protocol):
@@ -78,10 +80,10 @@ class TaskConfig:
         `ImitationEnv.features`.
     auto_reset: start a new episode where one ended (off while evaluating).
     recovery: falls and getting up, being far and coming back as part of the episodes, see
-        `poise.env.recovery.config`; None for episodes that begin and stay on their clip.
+        `poise.env.recovery.clock`; None for episodes that begin and stay on their clip.
     compliance: how goals give way where something pushes the characters, see `env.yielding`: by the
         paper's law, or by a commanded stiffness; None: they do not.
-    observables: more of what terms can ask a frame for, by name, see `env.observables`.
+    observables: more of what terms can ask a frame for, by name, see `env.frame`.
     velocities: first column of the observations that tell how far velocities are off the goal's, and the
         first after them: what a smooth policy shall not answer to (`PPOConfig.smooth_weight`).
     plugins: make more parts of an environment, each of its goal and backend, see `env.plugins`.
@@ -175,3 +177,51 @@ class StepLog(Mapping[str, float]):
 
     def __len__(self) -> int:
         return len(self._read())
+
+
+def goal_of(
+    reference: Reference, task: TaskConfig, backend: Backend, seed: int, weights: Tensor | None
+) -> ClipGoal:
+    """The clips of a reference as a goal, with the task's starts."""
+    bins = reference.bins, task.adaptive, task.adaptive_over
+    starts = Starts(reference.length, weights, seed, task.first, *bins)
+    return ClipGoal(reference, backend.num_envs, backend.device, starts)
+
+
+def plugins_of(
+    task: TaskConfig, goal: Goal, backend: Backend, seed: int
+) -> tuple[HelpBudget, tuple[Plugin, ...]]:
+    """The budget of help, and the plug-ins of a task in the order in which they are asked."""
+    schedule = task.help if task.auto_reset and task.residual else None
+    budget = HelpBudget(schedule, backend.device, goal.groups(task.help_by), task.help_by)
+    out: list[Plugin] = []
+    if task.adaptive and task.auto_reset:
+        sampling = AdaptiveSampling(goal.groups("bin"), backend.device)
+        goal.clips.odds = lambda: sampling.odds
+        out.append(sampling)
+    out.append(budget)
+    if goal.begins:
+        budget.use(goal.clips.drawn(task.help_by))
+    clock = None
+    if task.recovery is not None:
+        clock = RecoveryClock(task.recovery, backend, goal.humanoid, task.pd, goal.layout, seed)
+    if len(goal.bodies) > 1:
+        if clock is not None:
+            # Falls are those of the first body, which all worlds still have.
+            _ = clock.falls
+        out.append(BodyAssignment(backend, goal.bodies))
+    own = [make(goal, backend) for make in task.plugins]
+    out += [*([clock] if clock else []), *own]
+    if task.compliance is not None:
+        assert isinstance(goal, DisplacedGoal)
+        additive = task.pd.mode == "additive"
+        out.append(Yielding(task.compliance, goal, backend, additive, tuple(out)))
+    return budget, tuple(out)
+
+
+def displaced_goal(goal: Goal, task: TaskConfig) -> Goal:
+    """A goal that what pushes can displace, where the task has compliance."""
+    if task.compliance is None or isinstance(goal, DisplacedGoal):
+        return goal
+    hindsight = isinstance(task.compliance, Stiffness) and task.compliance.hindsight
+    return DisplacedGoal(goal, hindsight)

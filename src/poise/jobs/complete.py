@@ -14,28 +14,26 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.eval import ScoreCard
-from poise.jobs.deliver import Delivery
+from poise.formats import home_suffix, write_clip
+from poise.jobs.deliver import Delivery, Stage, key_errors, stage_of
 from poise.jobs.inbetween.fill import Inbetweened, inbetween
 from poise.jobs.open import open_run
 from poise.jobs.result import Result, Shown, clip_of
-from poise.jobs.stages import Stage, key_errors, stage_of
 from poise.jobs.track import TrackConfig, Tracked, track, write
-from poise.jobs.track.best import Merit
+from poise.jobs.track.controllers import Merit
 from poise.jobs.track.direction import Weight
-from poise.jobs.track.in_place import InPlace, with_travel
-from poise.jobs.track.story import story
+from poise.jobs.track.rates import InPlace, with_travel
+from poise.jobs.track.tracked import story
 from poise.jobs.tracker import Tracker
-from poise.kin import without_noise
-from poise.kin.rate.judge import judge_rate
-from poise.learn.model import InbetweenModel
+from poise.kinematics import without_noise
+from poise.kinematics.rate import judge_rate
+from poise.learn.inbetween import InbetweenModel
 from poise.motion import Clip
-from poise.motion.io import home_suffix, write_clip
 from poise.plan import LookaheadConfig
+from poise.score import ScoreCard
 from poise.settings import changed
-from poise.synth.gaps import check_keyframes
-from poise.synth.retime import Retiming, retimed
-from poise.synth.sparse import Partial, moved_to, timed
+from poise.synthesis.filler import check_keyframes
+from poise.synthesis.inbetween import Partial, Retiming, moved_to, retimed, timed
 
 #: How much more a keyframe counts than the frames between.
 KEY_WEIGHT = 20.0

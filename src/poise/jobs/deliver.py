@@ -2,29 +2,95 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
+from poise.formats import home_suffix, write_clip
 from poise.jobs.runs import Evaluation
-from poise.jobs.settled import as_file, settled
-from poise.kin import examine, hold_feet, lowest_height, qpos_to_clip
-from poise.kin.doctor.doctor import new_faults
-from poise.kin.doctor.support import SOLE_M
-from poise.kin.feet.height import stands_higher
-from poise.metrics import success
+from poise.kinematics import anatomy_of, examine, hold_feet, lowest_height, qpos_to_clip, support_of
+from poise.kinematics.feet import stands_higher
+from poise.kinematics.hold import FASTEST, mend_slides
+from poise.kinematics.repair.doctor import new_faults
+from poise.kinematics.repair.faults import Fault
+from poise.kinematics.repair.support import SOLE_M, slide_faults
+from poise.kinematics.repair.timing import body_steps
+from poise.metrics import jerk, success
 from poise.motion import Clip, ground_shift, resample
-from poise.motion.edits import blended
-from poise.motion.io import home_suffix, write_clip
+from poise.motion.clip import blended
 from poise.recipes.imitation import Imitation
+from poise.score import Recording, RolloutSet, ScoreCard, clip_figures, write_score
+from poise.score.report import Report, Shape, Track, write_report
 from poise.sim.props import Box
 from poise.version import __version__
-from poise.view import Report, Shape, Track, write_report
+
+#: By how much the largest jerk may grow with a foot that is held; s around where it slides that are
+#: looked at; how often what is rougher is left out.
+ROUGHER, AROUND_S, ROUNDS = 1.25, 0.5, 3
+
+
+def as_file(clip: Clip) -> Clip:
+    """A motion as it is read from its file: what tells the soles of some formats is lost in BVH."""
+    if home_suffix(clip) != ".bvh":
+        return clip
+    return clip.replaced(skeleton=clip.skeleton.with_source(format="bvh"))
+
+
+def settled(clip: Clip, source: Clip) -> Clip:
+    """The clip with its feet held where `poise doctor` says that they slide and the source's do not.
+
+    Some of what stands by the doctor's rules, which know no physics, does not bear by those of
+    `kin.hold_feet`. A foot is held only where the leg follows without a jerk.
+
+    Args:
+        source: what the clip follows, frame by frame.
+    """
+    faults, held = _new_slides(clip, source), as_file(clip)
+    support = support_of(held, anatomy_of(held)) if faults else None
+    for _ in range(ROUNDS):
+        if support is None or not faults:
+            break
+        mended = mend_slides(held, support, faults)
+        kept = _smooth(held, mended, faults)
+        if len(kept) == len(faults):
+            return clip.replaced(rot=mended.rot)
+        faults = kept
+    return clip
+
+
+def _new_slides(clip: Clip, source: Clip) -> list[Fault]:
+    """Slides of the clip in which that foot of the source does not slide."""
+    found = list[list[Fault]]()
+    for one in (as_file(clip), source):
+        support = support_of(one, anatomy_of(one))
+        found.append([] if support is None else slide_faults(one, support))
+    mine, theirs = found
+    return [
+        f
+        for f in mine
+        if not any(f.joint == g.joint and f.start <= g.stop and g.start <= f.stop for g in theirs)
+    ]
+
+
+def _smooth(before: Clip, after: Clip, faults: list[Fault]) -> list[Fault]:
+    """Those faults around which a repair neither jerks the body nor turns a joint too fast."""
+    was, now = (body_steps(c).max(-1) * c.fps for c in (before, after))
+    shook, shakes = (jerk(torch.tensor(c.positions()), c.fps).numpy() for c in (before, after))
+    most, around, out = (
+        ROUGHER * float(shook.max(initial=0.0)),
+        round(AROUND_S * before.fps),
+        list[Fault](),
+    )
+    for f in faults:
+        here = slice(max(0, f.start - around), f.stop + around)
+        fast = float(now[here].max(initial=0.0)) > max(FASTEST, float(was[here].max(initial=0.0)))
+        if not fast and float(shakes[here].max(initial=0.0)) <= most:
+            out.append(f)
+    return out
 
 
 def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0) -> Clip:
@@ -361,3 +427,56 @@ def _lasting(rollouts: RolloutSet, recording: Recording, name: str, frames: int)
     at = torch.arange(frames).clamp_max(last)
     row = recording.row
     return Track(name, rollouts.pos[row, at].numpy(), rollouts.quat[row, at].numpy())
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage made.
+
+    Attributes:
+        name: of the stage.
+        key_mm: mean distance of the joints from the keyframes, mm.
+        sole_slide_mm_per_s, penetration_mm, float_mm, jerk_m_per_s3: see `poise doctor`; None where no
+            human body is told by the joints' names.
+        fastest_m_per_s: of all joints.
+    """
+
+    name: str
+    key_mm: float
+    sole_slide_mm_per_s: float | None
+    penetration_mm: float | None
+    float_mm: float | None
+    jerk_m_per_s3: float | None
+    fastest_m_per_s: float
+
+    def sentence(self) -> str:
+        """The figures in words."""
+        parts = [f"keyframes off by {self.key_mm:.0f} mm"]
+        if self.sole_slide_mm_per_s is not None:
+            parts.append(f"soles slide at {self.sole_slide_mm_per_s:.0f} mm/s")
+        if self.jerk_m_per_s3 is not None:
+            parts.append(f"jerk {self.jerk_m_per_s3:.0f} m/s^3")
+        return f"{self.name}: {', '.join(parts)}, fastest joint {self.fastest_m_per_s:.1f} m/s."
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def key_errors(made: Clip, source: Clip, keys: Sequence[int], at: Sequence[int]) -> tuple[float, ...]:
+    """How far the joints are from each keyframe, mean, mm: of `made` in the frames `at`, of `source` in
+    the frames `keys`. A motion that ends before one is where it ended."""
+    have, wanted = made.positions(), source.positions()
+    return tuple(
+        1000 * float(np.linalg.norm(have[min(a, len(have) - 1)] - wanted[k], axis=-1).mean())
+        for a, k in zip(at, keys, strict=True)
+    )
+
+
+def stage_of(name: str, made: Clip, key_mm: Sequence[float]) -> Stage:
+    """The figures of a motion. key_mm: see `key_errors`."""
+    figures, pos = examine(made).figures, made.positions()
+    names = ("sole_slide_mm_per_s", "penetration_mm", "float_mm", "jerk_m_per_s3")
+    speed = np.linalg.norm(np.diff(pos, axis=0), axis=-1).max() * made.fps
+    slide, sinks, floats, jerk = (figures.get(n) for n in names)
+    return Stage(name, float(np.mean(key_mm)), slide, sinks, floats, jerk, float(speed))

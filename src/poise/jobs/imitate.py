@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from poise.errors import PoiseError
-from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, deliver, finished
 from poise.jobs.open import Run, open_run
 from poise.jobs.perpetual.stage_order import Progress
@@ -26,13 +25,15 @@ from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
 from poise.jobs.track import Tracked, write
-from poise.jobs.track.in_place import Mode, with_travel
+from poise.jobs.track.rates import with_travel
+from poise.jobs.track.settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, PolicyBundle, Until
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
+from poise.score import ScoreCard
 from poise.settings import changed
 
 #: The run folder in a result folder.

@@ -8,46 +8,47 @@ open_run().tracker                    # the policy that comes with Poise
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import (
+    FINAL,
     RUN_FILE,
     InbetweenMeta,
     RunFile,
     RunMeta,
     learning_curve,
+    policy_for,
     run_folder,
 )
 from poise.jobs.runs import Evaluation, evaluate, score, trained_policy, transitions
-from poise.jobs.tracker import (
-    POLICIES,
-    SHIPPED,
-    Tracker,
-    check_policy_file,
-    load_tracker,
-    policy_of_run,
-)
-from poise.learn import PolicyBundle, load_checkpoint
-from poise.learn.model import MODEL, InbetweenModel, load_model
-from poise.recipes.perpetual.config import config_of as perpetual_config
-from poise.recipes.perpetual.task import RECIPE as PERPETUAL
+from poise.jobs.tracker import POLICIES, SHIPPED, Tracker, check_policy_file, load_tracker
+from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint
+from poise.learn.checkpoint import under
+from poise.learn.inbetween import MODEL, InbetweenModel, load_model
+from poise.recipes.perpetual import RECIPE
+from poise.recipes.perpetual import RECIPE as PERPETUAL
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.perpetual_settings import config_of as perpetual_config
 from poise.recipes.residual_force import RECIPE as RESIDUAL_FORCE
 from poise.recipes.residual_force import build, config_of
 from poise.settings import check_data, from_data
+from poise.version import __version__
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from poise.eval import ScoreCard, Transitions
     from poise.motion import Clip
     from poise.recipes.imitation import Imitation
+    from poise.score import ScoreCard, Transitions
 
 #: The name of the recipe of in-betweening networks.
 INBETWEEN = "inbetween"
@@ -232,3 +233,57 @@ def _folder(folder: Path) -> Run:
     if file.recipe not in known:
         raise PoiseError(f"there is no recipe '{json.dumps(file.recipe)[1:40]}'", path)
     return Run(folder, file.recipe, known[file.recipe](meta["config"], path), file)
+
+
+def policy_of_run(file: RunFile) -> Tracker:
+    """The latest policy of a run of `poise train perpetual`.
+
+    Its body stands in the run file; where that is of an earlier version it is made from all clips again.
+
+    Raises:
+        PoiseError: a run of another recipe, or nothing was trained in it.
+    """
+    folder = file.path.parent
+    if file.recipe != RECIPE["name"]:
+        raise PoiseError(
+            "its policy knows only the clips that it was trained on, and cannot track others",
+            folder,
+            "Give the run of poise train perpetual, or imitate the clip with poise imitate",
+        )
+    config, example = perpetual_config(file.meta["config"], file.path), file.library().clips[0]
+    humanoid = None if config.body.mjcf else file.body(example.skeleton)
+    if humanoid is None:
+        made = perpetual_run.reopen(file)
+        humanoid, example, names = made.humanoid, made.library.clips[0], made.library.names
+        config, known = made.config, made.recovery_clips
+    else:
+        told, names = under(perpetual_run.WAYS, file.tensors), file.meta["body"]["names"]
+        known = RecoveryClips.of(told) if told else None
+        if known is None:
+            # As in a task that is built, see `recipes.perpetual.build`.
+            config = replace(config, recovering=replace(config.recovering, primitive="own"))
+        if config.recovery and not perpetual_run.knows_recovery(folder):
+            config, known = replace(config, recovery=False), None
+    earlier = file.earlier
+    policy, said = policy_for(folder, humanoid, config.help_start)
+    inner: Mapping[str, Any] = said.get("metadata", {})
+    about = {
+        "clips": list(names),
+        "stage": inner.get("stage") or inner.get("course", {}).get("stage", {}).get("kind", ""),
+        "finished": (folder / FINAL).exists(),
+        # With what the policy had cost that the run went on from.
+        "samples": int(said.get("samples", 0)) + earlier["samples"],
+        "seconds": float(said.get("seconds", 0.0)) + earlier["seconds"],
+        "help_n": float(said["help_limit"]),
+        "poise": __version__,
+    }
+    return Tracker(policy, humanoid, example, config, about, known, value_of_run(folder, policy, config))
+
+
+def value_of_run(folder: Path, policy: PolicyBundle, config: Perpetual) -> Value | None:
+    """The critic of a run's last checkpoint, None where there is none."""
+    path = folder / LATEST
+    if not path.exists():
+        return None
+    state = load_checkpoint(path)[0]
+    return Value(policy, state, config.ppo.activation) if "critic/layers.0.weight" in state else None

@@ -23,11 +23,20 @@ from typing import NamedTuple
 from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.run_file import RUN_FILE
 from poise.jobs.track import TrackConfig, Tracked, track
-from poise.jobs.track.best import LOST, TRACKED
-from poise.jobs.track.helping import GRAVITY, SHARES
-from poise.jobs.track.in_place import InPlace, Mode, with_travel
-from poise.jobs.track.learning import Learned, from_every_start, help_of, help_wanted, learn, with_help
+from poise.jobs.track.controllers import LOST, TRACKED
+from poise.jobs.track.learning import (
+    GRAVITY,
+    SHARES,
+    Learned,
+    from_every_start,
+    help_of,
+    help_wanted,
+    learn,
+    with_help,
+)
 from poise.jobs.track.placement import place
+from poise.jobs.track.rates import InPlace, with_travel
+from poise.jobs.track.settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.learn import Until
 from poise.motion import Clip

@@ -9,7 +9,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.jobs.endless.training import Endless
 from poise.jobs.inbetween.training import Inbetween, small
 from poise.motion import Clip
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.residual_force import ResidualForce
 
 #: The names of presets.

@@ -6,13 +6,13 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import NamedTuple
 
-from poise.eval import ScoreCard
-from poise.eval import table as rows_of
+from poise.formats import check_writable, names_file, write_clip
 from poise.jobs.keep import claimed, may_deliver, may_write, refusing
-from poise.kin.rate.reading import read_clip
+from poise.kinematics.rate import read_clip
 from poise.motion import Clip
-from poise.motion.io import check_writable, names_file, write_clip
-from poise.view.notebook import result_html
+from poise.score import ScoreCard
+from poise.score import table as rows_of
+from poise.score.report.svg import result_html
 
 
 class Shown(NamedTuple):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +23,11 @@ from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
+from poise.env.help import scale_in
 from poise.errors import PoiseError
-from poise.learn import LATEST, load_checkpoint, save_checkpoint
+from poise.formats.own import pack_clips, unpack_clips
+from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy, save_checkpoint
 from poise.motion import ClipLibrary, Skeleton
-from poise.motion.pack import pack_clips, unpack_clips
 from poise.settings import to_data
 
 #: The file that says what a run is.
@@ -254,3 +256,15 @@ def learning_curve(folder: Path) -> dict[str, np.ndarray]:
         rows = list(csv.DictReader(file))
     names = rows[0].keys() if rows else ()
     return {name: np.array([float(r[name] or "nan") for r in rows]) for name in names}
+
+
+def policy_for(folder: Path, humanoid: Humanoid, most: float) -> tuple[PolicyBundle, dict[str, Any]]:
+    """`trained_policy` for a body. most: N, the highest limit of the help at any time."""
+    path = latest_policy(folder)
+    policy = load_policy(path, character=humanoid.identity)
+    if path.name == FINAL:
+        return policy, policy.meta | policy.meta.get("metadata", {}) | {"help_limit": 0.0}
+    left = scale_in(load_checkpoint(path)[0]) * most
+    if not math.isfinite(left):
+        raise PoiseError("the help that is left in it is no number", path)
+    return policy, {**policy.meta, "help_limit": left}

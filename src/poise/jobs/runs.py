@@ -12,11 +12,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
-from poise.env.help import scale_in
 from poise.errors import PoiseError
-from poise.eval import (
+from poise.jobs.run_file import (
+    RUN_FILE,
+    body_facts,
+    held_run,
+    policy_for,
+    write_run,
+)
+from poise.jobs.warm_start import TrainingCallbacks, some_starts, start_training
+from poise.learn import (
+    IterationStats,
+    Policy,
+    PolicyBundle,
+    RunResult,
+    Until,
+    run,
+)
+from poise.learn.checkpoint import only_writer
+from poise.learn.parallel import ALONE, Comm, together
+from poise.motion import ClipLibrary
+from poise.recipes.imitation import Imitation
+from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
+from poise.score import (
     TRACKING,
     Nothing,
     Recording,
@@ -29,30 +48,6 @@ from poise.eval import (
     score_rollouts,
     start_frames,
 )
-from poise.jobs.run_file import (
-    FINAL,
-    RUN_FILE,
-    body_facts,
-    held_run,
-    latest_policy,
-    write_run,
-)
-from poise.jobs.warm_start import TrainingCallbacks, some_starts, start_training
-from poise.learn import (
-    IterationStats,
-    Policy,
-    PolicyBundle,
-    RunResult,
-    Until,
-    load_checkpoint,
-    load_policy,
-    run,
-)
-from poise.learn.lock import only_writer
-from poise.learn.parallel import ALONE, Comm, together
-from poise.motion import ClipLibrary
-from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
 from poise.settings import to_data
 
 
@@ -111,18 +106,6 @@ def train(
 def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, dict[str, Any]]:
     """The run's latest policy, or that of a finished run, and its checkpoint's metadata."""
     return policy_for(folder, imitation.humanoid, most_help(imitation.config))
-
-
-def policy_for(folder: Path, humanoid: Humanoid, most: float) -> tuple[PolicyBundle, dict[str, Any]]:
-    """`trained_policy` for a body. most: N, the highest limit of the help at any time."""
-    path = latest_policy(folder)
-    policy = load_policy(path, character=humanoid.identity)
-    if path.name == FINAL:
-        return policy, policy.meta | policy.meta.get("metadata", {}) | {"help_limit": 0.0}
-    left = scale_in(load_checkpoint(path)[0]) * most
-    if not math.isfinite(left):
-        raise PoiseError("the help that is left in it is no number", path)
-    return policy, {**policy.meta, "help_limit": left}
 
 
 def help_left(

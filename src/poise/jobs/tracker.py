@@ -21,19 +21,16 @@ from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
+from poise.formats.own import pack_clips, unpack_clips
 from poise.jobs.library.clips import Target
-from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.run_file import FINAL, RUN_FILE, RunFile
-from poise.jobs.runs import policy_for
-from poise.kin import RetargetConfig, onto_own, own_body
-from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
-from poise.learn.checkpoint import PolicyMeta
+from poise.jobs.run_file import RUN_FILE
+from poise.kinematics import RetargetConfig, onto_own, own_body
+from poise.learn import PolicyBundle, Value, load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import PolicyMeta, prefixed, under
 from poise.learn.policy import policy_in
-from poise.learn.state import prefixed, under
 from poise.motion import Clip, trim
-from poise.motion.pack import pack_clips, unpack_clips
-from poise.recipes.perpetual import RECIPE, Perpetual
-from poise.recipes.perpetual.config import config_of
+from poise.recipes.perpetual import RECIPE
+from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.settings import check_data, to_data
 from poise.version import __version__
 
@@ -127,60 +124,6 @@ class Tracker:
         humanoid = make_humanoid(self.humanoid.skeleton, table)
         config = replace(config, body=replace(config.body, damping=seconds))
         return replace(self, humanoid=humanoid, config=config)
-
-
-def policy_of_run(file: RunFile) -> Tracker:
-    """The latest policy of a run of `poise train perpetual`.
-
-    Its body stands in the run file; where that is of an earlier version it is made from all clips again.
-
-    Raises:
-        PoiseError: a run of another recipe, or nothing was trained in it.
-    """
-    folder = file.path.parent
-    if file.recipe != RECIPE["name"]:
-        raise PoiseError(
-            "its policy knows only the clips that it was trained on, and cannot track others",
-            folder,
-            "Give the run of poise train perpetual, or imitate the clip with poise imitate",
-        )
-    config, example = config_of(file.meta["config"], file.path), file.library().clips[0]
-    humanoid = None if config.body.mjcf else file.body(example.skeleton)
-    if humanoid is None:
-        made = perpetual_run.reopen(file)
-        humanoid, example, names = made.humanoid, made.library.clips[0], made.library.names
-        config, known = made.config, made.recovery_clips
-    else:
-        told, names = under(perpetual_run.WAYS, file.tensors), file.meta["body"]["names"]
-        known = RecoveryClips.of(told) if told else None
-        if known is None:
-            # As in a task that is built, see `recipes.perpetual.build`.
-            config = replace(config, recovering=replace(config.recovering, primitive="own"))
-        if config.recovery and not perpetual_run.knows_recovery(folder):
-            config, known = replace(config, recovery=False), None
-    earlier = file.earlier
-    policy, said = policy_for(folder, humanoid, config.help_start)
-    inner: Mapping[str, Any] = said.get("metadata", {})
-    about = {
-        "clips": list(names),
-        "stage": inner.get("stage") or inner.get("course", {}).get("stage", {}).get("kind", ""),
-        "finished": (folder / FINAL).exists(),
-        # With what the policy had cost that the run went on from.
-        "samples": int(said.get("samples", 0)) + earlier["samples"],
-        "seconds": float(said.get("seconds", 0.0)) + earlier["seconds"],
-        "help_n": float(said["help_limit"]),
-        "poise": __version__,
-    }
-    return Tracker(policy, humanoid, example, config, about, known, value_of_run(folder, policy, config))
-
-
-def value_of_run(folder: Path, policy: PolicyBundle, config: Perpetual) -> Value | None:
-    """The critic of a run's last checkpoint, None where there is none."""
-    path = folder / LATEST
-    if not path.exists():
-        return None
-    state = load_checkpoint(path)[0]
-    return Value(policy, state, config.ppo.activation) if "critic/layers.0.weight" in state else None
 
 
 def save_tracker(tracker: Tracker, path: Path) -> None:

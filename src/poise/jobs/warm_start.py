@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.eval import ScoreCard, run_episodes, score_rollouts, start_frames
 from poise.learn import (
     LATEST,
     CloneConfig,
@@ -29,12 +28,13 @@ from poise.learn import (
     load_checkpoint,
 )
 from poise.learn.checkpoint import PolicyMeta
+from poise.learn.networks import RunningNorm
 from poise.learn.parallel import ALONE, Comm, any_of, together
 from poise.learn.policy import spread
-from poise.nets import RunningNorm
 from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual.task import pushed, stage_task
+from poise.recipes.perpetual import pushed, stage_task
+from poise.score import ScoreCard, run_episodes, score_rollouts, start_frames
 from poise.sim import UnstableError
 
 if TYPE_CHECKING:

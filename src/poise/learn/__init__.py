@@ -2,15 +2,11 @@
 
 from poise.learn.amp import Amp, AmpConfig
 from poise.learn.checkpoint import LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint
-from poise.learn.clone import CloneConfig, CloneStats, clone
-from poise.learn.config import PPOConfig
-from poise.learn.lessons import LessonConfig
-from poise.learn.log import Log
-from poise.learn.losses import gae
+from poise.learn.clone import CloneConfig, CloneStats, LessonConfig, clone
 from poise.learn.mining import Convergence, ConvergenceConfig, Decision, HardNegatives, MiningConfig
 from poise.learn.policy import PolicyBundle, Value, WarmStart, load_policy
-from poise.learn.ppo import PPO, UpdateStats
-from poise.learn.progressive import columns_of, compose, first_column, next_column, primitive
+from poise.learn.ppo import PPO, PPOConfig, UpdateStats, gae
+from poise.learn.primitives import columns_of, compose, first_column, next_column, primitive
 from poise.learn.protocols import (
     DemoSampler,
     FeatureSource,
@@ -22,7 +18,7 @@ from poise.learn.protocols import (
     VecEnv,
 )
 from poise.learn.rollout import Rollout, TrainingError
-from poise.learn.run import RunResult, Until, run
+from poise.learn.run import Log, RunResult, Until, run
 from poise.learn.train import IterationStats, Trainer
 
 __all__ = [

@@ -1,32 +1,18 @@
-"""Adversarial motion prior (Peng et al. 2021): a reward for moving as the clips do.
-
-A discriminator D tells windows of W frames of the clips ("demos") from those of the character:
-
-    L = 1/2 [ BCE(D(agent), 0) + BCE(D(demo), 1) ] + w_gp mean ||dD/dx(demo)||^2
-        + w_logit ||last weights||^2 + w_decay sum ||weights||^2
-
-    r = w_task r_task + w_style r_style,     r_style = -log(max(1 - sigmoid(D), 1e-4)) scale
-
-`Amp` is handed to a `Trainer` as its `style`. PHC's energy penalty is not halved (Eq. 1): an environment
-that counts it in r_task gives it the weight 1 / w_task.
-"""
+"""Adversarial motion prior (Peng et al. 2021): a reward for moving as the clips do."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_statistics, sums
-from poise.learn.protocols import DemoSampler, FeatureSource
-from poise.learn.rollout import TrainingError, check_finite
-from poise.learn.state import (
+from poise.learn.checkpoint import (
     State,
     load_module,
     load_optimizer_state,
@@ -37,9 +23,63 @@ from poise.learn.state import (
     take,
     under,
 )
+from poise.learn.networks import MLP, RunningNorm
+from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_statistics, sums
+from poise.learn.protocols import DemoSampler, FeatureSource
+from poise.learn.rollout import TrainingError, check_finite
 from poise.learn.windows import History, WindowBuffer
-from poise.nets.discriminator import Discriminator, gradient_penalty
 from poise.settings import validate
+
+
+class Discriminator(nn.Module):
+    """One logit D per window of W frames with F features: high for clips, low for the character.
+
+    Args:
+        frames, features: W and F.
+        hidden, activation: of the perceptron over the W F normalised features.
+        clip: bound of the normalised features. Their statistics are shared by the frames of a window.
+        generator: source of the first weights.
+    """
+
+    def __init__(
+        self,
+        frames: int,
+        features: int,
+        hidden: Sequence[int] = (256, 128),
+        activation: str = "relu",
+        clip: float = 5.0,
+        *,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        self.frames, self.features = frames, features
+        self.norm = RunningNorm(features, clip)
+        self.net = MLP(frames * features, hidden, 1, activation, generator=generator)
+
+    def normalise(self, windows: Tensor) -> Tensor:
+        """Windows `(N, W F)` or `(N, W, F)`, oldest frame first, as what the network sees `(N, W F)`."""
+        return self.norm(windows.reshape(-1, self.frames, self.features)).flatten(1)
+
+    def logit(self, x: Tensor) -> Tensor:
+        """D `(N,)` of normalised windows `(N, W F)`."""
+        return self.net(x).squeeze(-1)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """D `(N,)` of raw windows `(N, W F)` or `(N, W, F)`."""
+        return self.logit(self.normalise(windows))
+
+    def weights(self) -> list[Tensor]:
+        """The weight matrices without the biases, the output layer's last."""
+        return [p for name, p in self.net.named_parameters() if name.endswith("weight")]
+
+
+def gradient_penalty(net: Discriminator, x: Tensor) -> tuple[Tensor, Tensor]:
+    """mean_n ||dD/dx_n||^2 of normalised windows `x (N, W F)`, a scalar with gradients; and D `(N,)`."""
+    x = x.detach().requires_grad_()
+    logit = net.logit(x)
+    (slope,) = torch.autograd.grad(logit.sum(), x, create_graph=True)
+    return slope.square().sum(-1).mean(), logit
+
 
 Loss = Literal["bce", "least_squares"]
 LEAST = 1e-4  # Of 1 - sigmoid(D): no window is worth more than -log(LEAST) scale.

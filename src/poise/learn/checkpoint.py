@@ -1,27 +1,25 @@
-"""Checkpoints: one file of weights with its JSON inside, written whole or not at all.
-
-The file is safetensors; its metadata holds one JSON object, so weights and settings can never
-belong to different moments. It is written beside its place, flushed to the disk and renamed.
-
-Files come from strangers, too: `load_checkpoint(path, TrainerMeta)` refuses, in a sentence, metadata in
-which something is missing or of another type.
-"""
+"""Checkpoints: one file of weights with its JSON inside, written whole or not at all, by one writer."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
+import importlib
 import json
 import os
+import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Any, Concatenate, Literal, ParamSpec, TypedDict, TypeVar
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as parse_tensors
 from safetensors.torch import save as serialise_tensors
-from torch import Tensor
+from torch import Tensor, nn
 
 from poise.errors import PoiseError
 from poise.settings import check_data
@@ -227,3 +225,146 @@ class ModelMeta(_Model, total=False):
     """The file of an in-betweening network."""
 
     example: list[dict[str, Any]]
+
+
+State = dict[str, Tensor]
+
+
+def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> State:
+    """The tensors as clones under "prefix/name"."""
+    return {f"{prefix}/{k}": v.detach().clone() for k, v in tensors.items()}
+
+
+def under(prefix: str, tensors: Mapping[str, Tensor]) -> State:
+    """The tensors with names that start with "prefix/", without it."""
+    start = f"{prefix}/"
+    return {k[len(start) :]: v for k, v in tensors.items() if k.startswith(start)}
+
+
+def take(state: Mapping[str, Tensor], name: str) -> Tensor:
+    """One tensor of a state, or a `PoiseError` that names it."""
+    if name not in state:
+        raise PoiseError(
+            f"the saved state has no '{name}'", hint="Another kind of run saved it; start a new one"
+        )
+    return state[name]
+
+
+def load_module(module: nn.Module, state: Mapping[str, Tensor], name: str) -> None:
+    """Copies "name/..." into a module; shapes and names must be the same."""
+    own, saved = module.state_dict(), under(name, state)
+    for key, value in own.items():
+        if key in saved and saved[key].shape == value.shape:
+            continue
+        found = f"has the shape {tuple(saved[key].shape)}" if key in saved else "is missing"
+        raise PoiseError(
+            f"'{name}/{key}' {found} in the saved state where {tuple(value.shape)} is expected",
+            hint="Use the layer sizes and the environment with which the state was saved",
+        )
+    with torch.no_grad():
+        for key, value in own.items():
+            value.copy_(saved[key])
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
+    """Learning rates and moments, numbered in the order of the parameters."""
+    lr = [group["lr"] for group in optimizer.param_groups]
+    out = {"lr": torch.tensor(lr, dtype=torch.float64)}
+    params = [p for group in optimizer.param_groups for p in group["params"]]
+    for i, p in enumerate(params):
+        # A parameter that was never stepped has no moments yet.
+        out |= {f"{i}/{k}": v.detach().clone() for k, v in optimizer.state.get(p, {}).items()}
+    return out
+
+
+def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor]) -> None:
+    """Restores what `optimizer_state` returned."""
+    rates, hint = take(state, "lr"), "Use the layer sizes with which the state was saved"
+    if rates.shape != (len(optimizer.param_groups),):
+        raise PoiseError(
+            f"the saved optimiser has learning rates of shape {tuple(rates.shape)}", hint=hint
+        )
+    for group, lr in zip(optimizer.param_groups, rates.tolist(), strict=True):
+        group["lr"] = lr
+    optimizer.state.clear()
+    params = [p for group in optimizer.param_groups for p in group["params"]]
+    for i, p in enumerate(params):
+        moments = {k: v.detach().clone() for k, v in under(str(i), state).items()}
+        for name, value in moments.items():
+            # A moment is as its parameter, the count of steps a number.
+            if value.shape != p.shape and (name != "step" or value.numel() != 1):
+                what = f"the saved optimiser's '{i}/{name}' has the shape {tuple(value.shape)}"
+                raise PoiseError(f"{what} where {tuple(p.shape)} is expected", hint=hint)
+        if moments:
+            optimizer.state[p] = {k: v.to(p.device) for k, v in moments.items()}
+
+
+def make_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator of its own for each purpose, so that one draw more here moves nothing there."""
+    digest = hashlib.sha256(f"{seed}:{purpose}".encode()).digest()
+    return torch.Generator(device=device).manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
+def set_generator(generator: torch.Generator, state: Tensor) -> None:
+    """Goes on from a generator's state.
+
+    The state of another kind of device cannot be taken over; it becomes a seed, so that the same
+    run resumed there twice is the same.
+    """
+    if generator.get_state().shape == state.shape:
+        generator.set_state(state.cpu())
+        return
+    digest = hashlib.sha256(state.cpu().numpy().tobytes()).digest()
+    generator.manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
+#: Seconds in which the processes of a training that was killed just now may end.
+PATIENCE_S = 3.0
+_POLL_S = 0.1
+P = ParamSpec("P")
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@contextmanager
+def only_writer(folder: Path) -> Generator[None]:
+    """Holds a folder as its only writer; the system lets go of it however the process ends.
+
+    Where folders cannot be locked (Windows, some network disks) nothing is held.
+
+    Raises:
+        PoiseError: another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if os.name != "posix":
+        yield
+        return
+    fcntl: Any = importlib.import_module("fcntl")
+    held = os.open(folder, os.O_RDONLY)
+    end = time.monotonic() + PATIENCE_S
+    try:
+        while True:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    hint = "Wait until it ends, or choose another folder"
+                    raise PoiseError("another training writes here", folder, hint) from None
+                time.sleep(_POLL_S)
+            except OSError:
+                break
+        yield
+    finally:
+        os.close(held)
+
+
+def alone(train: Callable[Concatenate[T, Path, P], R]) -> Callable[Concatenate[T, Path, P], R]:
+    """A training that takes its folder as second argument, as that folder's only writer."""
+
+    @functools.wraps(train)
+    def held(what: T, folder: Path, *args: P.args, **kwargs: P.kwargs) -> R:
+        with only_writer(folder):
+            return train(what, folder, *args, **kwargs)
+
+    return held

@@ -1,32 +1,305 @@
-"""How a kinematic policy is learned: the evidence lower bound of Residual Force Control's Eq. 6.
-
-    L = |x - x~|^2 / (2 beta) + max(KL(q(z | x) || N(0, I)), tolerance)
-
-with squares of numbers in deviations, summed over a future. Its own past (Algorithm 1, line 11) is what
-a policy sees after the first segment, so it learns from that, too: in a share of the batches further
-segments follow those that it made. What is off at a segment's beginning is not to be gone in its first
-frame, which would jerk; it dies down as a critically damped spring does,
-
-    x'(t) = x(t) + (o + (v + o / s) t) exp(-t / s)
-
-with o the last frame's offset from the truth, v its change in a frame, and s frames. A past that is
-partly of another window teaches the same: the way back to motion that there is.
-"""
+"""A kinematic policy as a conditional variational autoencoder, and how it is learned (RFC, Eq. 6)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.nets.cosine_cvae import CosineCVAE
-from poise.nets.cvae import CVAE, Code
-from poise.nets.mlp import bfloat16_is_fast
+from poise.learn.networks import MLP, bare_linear, bfloat16_is_fast, product
 from poise.settings import validate
+
+_MIN_STD = 1e-3
+
+
+@dataclass(frozen=True)
+class CVAEConfig:
+    """Sizes; widths of the layers stand in a picture that the paper's text does not give, and are ours.
+
+    Attributes:
+        past, future: p and f, frames that are seen and made.
+        latent: size of z.
+        hidden: width of the recurrent units.
+        layers: widths of the layers between them and what they say.
+        decoder: "recurrent", the paper's, or "cosine", see `learn.cvae`, for which `hidden`
+            counts as well, but not `layers`.
+        cosines: of "cosine", how many a past and a future are made of. 24 of 60 frames at 30 Hz go up
+            to 6 Hz.
+        blocks: of "cosine", pairs of layers.
+    """
+
+    past: int = 30
+    future: int = 60
+    latent: int = 128
+    hidden: int = 256
+    layers: tuple[int, ...] = (256,)
+    decoder: Literal["recurrent", "cosine"] = "recurrent"
+    cosines: int = 24
+    blocks: int = 2
+
+    def __post_init__(self) -> None:
+        validate(self)
+        sizes = (self.past, self.future, self.latent, self.hidden, self.cosines, self.blocks)
+        if min(*sizes, *self.layers) < 1 or self.past < 2:
+            raise PoiseError("every size must be at least 1, and the past 2 frames", "CVAEConfig")
+
+
+class Code(NamedTuple):
+    """The encoder's Gaussian: `mean (N, Z)` and `log_var (N, Z)`."""
+
+    mean: Tensor
+    log_var: Tensor
+
+    def draw(self, rng: torch.Generator) -> Tensor:
+        """A sample `(N, Z)`, through which gradients flow."""
+        noise = torch.randn(self.mean.shape, generator=rng).to(self.mean)
+        return self.mean + (0.5 * self.log_var).exp() * noise
+
+    def divergence(self) -> Tensor:
+        """KL(q || N(0, I)) `(N)`, nats."""
+        return 0.5 * (self.mean.square() + self.log_var.exp() - 1 - self.log_var).sum(-1)
+
+
+class CVAE(nn.Module):
+    """The encoder and the decoder; see the module's text.
+
+    Args:
+        features: numbers in a frame.
+        generator: source of the first weights.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, features: int, config: CVAEConfig | None = None, *, generator: torch.Generator):
+        super().__init__()
+        self.features, self.config = features, config or CVAEConfig()
+        c = self.config
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("std", torch.ones(features))
+        self.seen = _gru(features, c.hidden, generator)
+        self.coming = _gru(features, c.hidden, generator)
+        self.posterior = MLP(2 * c.hidden, c.layers, 2 * c.latent, "relu", 0.1, generator=generator)
+        self.begin = MLP(c.hidden + c.latent, c.layers, c.hidden, "relu", generator=generator)
+        self.cell = Cell(c.hidden + c.latent, features, c.hidden, generator)
+        self.said = MLP(c.hidden, c.layers, features, "relu", 0.1, generator=generator)
+
+    @torch.no_grad()
+    def calibrate(self, frames: Tensor) -> None:
+        """Takes the scale of every number from frames `(F, D)`."""
+        self.mean.copy_(frames.mean(0))
+        self.std.copy_(frames.std(0).clamp_min(_MIN_STD))
+
+    def scaled(self, frames: Tensor) -> Tensor:
+        """Frames in deviations from the mean."""
+        return (frames - self.mean) / self.std
+
+    def encode(self, past: Tensor, future: Tensor) -> Code:
+        """What happens after a past `(N, p, D)` in a future `(N, f, D)`, both scaled."""
+        a, b = self.seen(past)[1][0], self.coming(future)[1][0]
+        return Code(*self.posterior(torch.cat((a, b), -1)).chunk(2, -1))
+
+    def decode(self, past: Tensor, z: Tensor, frames: int | None = None) -> Tensor:
+        """The mean future `(N, f, D)` after a past `(N, p, D)`, both scaled, with `z (N, Z)`."""
+        h = self.seen(past)[1][0]
+        context = torch.cat((h, z), -1)
+        memory, y, out = self.begin(context), past[:, -1], list[Tensor]()
+        steady = self.cell.steady(context)
+        for _ in range(frames or self.config.future):
+            memory = self.cell(steady, y, memory)
+            y = y + self.said(memory)
+            out.append(y)
+        return torch.stack(out, 1)
+
+    def draw(self, count: int, rng: torch.Generator, temperature: float = 1.0) -> Tensor:
+        """z `(count, Z)` of the prior N(0, temperature^2)."""
+        return temperature * torch.randn(count, self.config.latent, generator=rng).to(self.mean)
+
+    def continued(self, past: Tensor, z: Tensor) -> Tensor:
+        """The same as `decode` in the frames' own units."""
+        return self.decode(self.scaled(past), z) * self.std + self.mean
+
+
+class Cell(nn.Module):
+    """A gated recurrent unit (Cho et al. 2014) with a part of its input that stays the same.
+
+        r, u = sigma(a_r + b_r), sigma(a_u + b_u),  n = tanh(a_n + r b_n),  h' = (1 - u) n + u h
+
+    with a = W [context; y] + c and b = V h + d. What the context adds is worked out once.
+    """
+
+    def __init__(self, context: int, features: int, hidden: int, generator: torch.Generator):
+        super().__init__()
+        self.of_context = bare_linear(context, 3 * hidden)
+        self.of_input = bare_linear(features, 3 * hidden, bias=False)
+        self.of_memory = bare_linear(hidden, 3 * hidden)
+        _fill(self, hidden, generator)
+
+    def steady(self, context: Tensor) -> Tensor:
+        """What a context `(N, C)` adds to every step, `(N, 3 h)`."""
+        return self.of_context(context)
+
+    def forward(self, steady: Tensor, y: Tensor, memory: Tensor) -> Tensor:
+        """The memory `(N, h)` after an input `y (N, D)`."""
+        a_r, a_u, a_n = (steady + self.of_input(y)).chunk(3, -1)
+        b_r, b_u, b_n = self.of_memory(memory).chunk(3, -1)
+        update = torch.sigmoid(a_u + b_u)
+        new = torch.tanh(a_n + torch.sigmoid(a_r + b_r) * b_n)
+        return torch.lerp(new, memory, update)
+
+
+def _gru(features: int, hidden: int, generator: torch.Generator) -> nn.GRU:
+    # Nothing is drawn from the global generator.
+    with torch.random.fork_rng(devices=[]):
+        module = nn.GRU(features, hidden, batch_first=True)
+    _fill(module, hidden, generator)
+    return module
+
+
+def _fill(module: nn.Module, hidden: int, generator: torch.Generator) -> None:
+    """The usual first weights of recurrent units, U(-1 / sqrt(h), 1 / sqrt(h))."""
+    with torch.no_grad():
+        for p in module.parameters():
+            p.uniform_(-(hidden**-0.5), hidden**-0.5, generator=generator)
+
+
+_MIN_STD_cosine_cvae = 1e-3
+#: Frames in which a velocity that is left to itself dies down, and in which cosines set in.
+_FADE, _RAMP = 4.0, 10.0
+#: Between which the logarithm of a code's variance stays.
+_LOG_VAR = (-8.0, 2.0)
+
+
+class CosineCVAE(nn.Module):
+    """The encoder and the decoder; see the module's text. What its methods do is as in `CVAE`.
+
+    Args:
+        features: numbers in a frame.
+        generator: source of the first weights.
+    """
+
+    mean: Tensor
+    std: Tensor
+    seen: Tensor
+    told: Tensor
+    coming: Tensor
+    going: Tensor
+
+    def __init__(self, features: int, config: CVAEConfig, *, generator: torch.Generator):
+        super().__init__()
+        self.features, self.config = features, config
+        c = config
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("std", torch.ones(features))
+        # Made from the sizes, so not among the weights.
+        t = torch.arange(1, c.future + 1, dtype=torch.float32)
+        ramp = (t / _RAMP).clamp_max(1.0).square()[:, None]
+        known, made = min(c.past, c.cosines), min(c.future, c.cosines)
+        self.register_buffer("seen", cosines(c.past, known), persistent=False)
+        self.register_buffer("coming", cosines(c.future, made), persistent=False)
+        self.register_buffer("told", ramp * cosines(c.future, made) * c.future**0.5, persistent=False)
+        self.register_buffer("going", _FADE * (1 - torch.exp(-t / _FADE)), persistent=False)
+        wide = (known + 2) * features
+        self.encoder = Residual(wide + made * features, c.hidden, c.blocks, 2 * c.latent, 0.1, generator)
+        self.decoder = Residual(wide + c.latent, c.hidden, c.blocks, made * features, 0.1, generator)
+
+    @torch.no_grad()
+    def calibrate(self, frames: Tensor) -> None:
+        """Takes the scale of every number from frames `(F, D)`."""
+        self.mean.copy_(frames.mean(0))
+        self.std.copy_(frames.std(0).clamp_min(_MIN_STD_cosine_cvae))
+
+    def scaled(self, frames: Tensor) -> Tensor:
+        """Frames in deviations from the mean."""
+        return (frames - self.mean) / self.std
+
+    def _context(self, past: Tensor) -> Tensor:
+        """What is seen of a past: its slow part, its last frame, its velocity (in 5 frames' change)."""
+        with _exact():
+            low = torch.einsum("tk,ntd->nkd", self.seen, past) / self.config.past**0.5
+        last = past[:, -1]
+        return torch.cat((low.flatten(1), last, 5 * (last - past[:, -2])), -1)
+
+    def encode(self, past: Tensor, future: Tensor) -> Code:
+        """What happens after a past `(N, p, D)` in a future `(N, f, D)`, both scaled."""
+        with _exact():
+            ahead = torch.einsum("tk,ntd->nkd", self.coming, future - past[:, -1:])
+            ahead = ahead / self.config.future**0.5
+        code = self.encoder(torch.cat((self._context(past), ahead.flatten(1)), -1))
+        mean, log_var = code.float().chunk(2, -1)
+        return Code(mean, log_var.clamp(*_LOG_VAR))
+
+    def decode(self, past: Tensor, z: Tensor, frames: int | None = None) -> Tensor:
+        """The mean future `(N, f, D)` after a past `(N, p, D)`, both scaled, with `z (N, Z)`."""
+        f = frames or self.config.future
+        parts = self.decoder(torch.cat((self._context(past), z), -1))
+        parts = parts.unflatten(-1, (-1, self.features)).float()
+        last = past[:, -1]
+        going = last[:, None] + self.going[:f, None] * (last - past[:, -2])[:, None]
+        with _exact():
+            return going + torch.einsum("tk,nkd->ntd", self.told[:f], parts)
+
+    def draw(self, count: int, rng: torch.Generator, temperature: float = 1.0) -> Tensor:
+        """z `(count, Z)` of the prior N(0, temperature^2)."""
+        return temperature * torch.randn(count, self.config.latent, generator=rng).to(self.mean)
+
+    def continued(self, past: Tensor, z: Tensor) -> Tensor:
+        """The same as `decode` in the frames' own units."""
+        return self.decode(self.scaled(past), z) * self.std + self.mean
+
+
+class Residual(nn.Module):
+    """A perceptron with layers that add to what came before them: x + W_2 silu(W_1 norm(x))."""
+
+    def __init__(
+        self, num_in: int, width: int, blocks: int, num_out: int, last: float, rng: torch.Generator
+    ):
+        super().__init__()
+        self.enter = _layer(num_in, width, 1.0, rng)
+        self.norms = nn.ModuleList([nn.LayerNorm(width) for _ in range(blocks)])
+        self.up = nn.ModuleList([_layer(width, width, 1.0, rng) for _ in range(blocks)])
+        self.down = nn.ModuleList([_layer(width, width, 0.3, rng) for _ in range(blocks)])
+        self.leave = _layer(width, num_out, last, rng)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(N, num_in)` to `(N, num_out)`."""
+        x = product(self.enter, x)
+        for norm, up, down in zip(self.norms, self.up, self.down, strict=True):
+            x = x + product(down, nn.functional.silu(product(up, norm(x))))
+        return product(self.leave, x, last=True)
+
+
+def make_cvae(features: int, config: CVAEConfig, rng: torch.Generator) -> CVAE | CosineCVAE:
+    """The network that a configuration names, with first weights from `rng`."""
+    kind = CVAE if config.decoder == "recurrent" else CosineCVAE
+    return kind(features, config, generator=rng)
+
+
+def cosines(frames: int, count: int) -> Tensor:
+    """The slowest `count` orthonormal cosines of `frames` frames `(frames, count)` (DCT-II)."""
+    t, k = torch.arange(frames).double()[:, None], torch.arange(count).double()
+    out = torch.cos(math.pi * (t + 0.5) * k / frames) * math.sqrt(2 / frames)
+    out[:, 0] /= math.sqrt(2)
+    return out.float()
+
+
+def _exact() -> torch.autocast:
+    """Sums of frames stay in float32 where layers are in bfloat16."""
+    return torch.autocast("cpu", enabled=False)
+
+
+def _layer(num_in: int, num_out: int, scale: float, rng: torch.Generator) -> nn.Linear:
+    layer = bare_linear(num_in, num_out)
+    with torch.no_grad():
+        layer.weight.uniform_(-scale * num_in**-0.5, scale * num_in**-0.5, generator=rng)
+        layer.bias.zero_()
+    return layer
+
 
 #: Deviations beyond which numbers of its own past are no motion.
 FAR = 8.0

@@ -1,36 +1,44 @@
-"""Trains a network of kinematic motion: blocks of steps, checkpoints that go on bit for bit, a log."""
+"""Trains, stores and adapts a network of kinematic motion."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import copy
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import LATEST, load_checkpoint, remove_partial, save_checkpoint
-from poise.learn.lock import alone
-from poise.learn.log import Log
-from poise.learn.rollout import TrainingError
-from poise.learn.run import interruptible
-from poise.learn.state import (
+from poise.learn.between import Between, BetweenConfig
+from poise.learn.checkpoint import (
+    LATEST,
+    ModelMeta,
     State,
+    alone,
+    load_checkpoint,
     load_module,
     load_optimizer_state,
     make_generator,
     optimizer_state,
     prefixed,
+    remove_partial,
+    save_checkpoint,
     set_generator,
     take,
     under,
 )
+from poise.learn.rollout import TrainingError
+from poise.learn.rtn import RTN, RTNConfig
+from poise.learn.run import Log, interruptible
+from poise.learn.transition import Filled, Known, Layout, TransitionNet, joint_positions
+from poise.settings import check_data, from_data, validate
 
 #: Times that saving takes, which pass until the next checkpoint at least.
 _SAVING = 20.0
@@ -140,7 +148,8 @@ class InbetweenTrainer:
         # The first steps would otherwise weigh as much as a thousand later ones.
         keep = min(self.ema, (1 + self.step) / (10 + self.step))
         own = self.objective.modules()["net"]
-        torch._foreach_lerp_(list(self.averaged.parameters()), list(own.parameters()), 1 - keep)
+        for a, b in zip(self.averaged.parameters(), own.parameters(), strict=True):
+            a.lerp_(b, 1 - keep)
         for a, b in zip(self.averaged.buffers(), own.buffers(), strict=True):
             a.copy_(b)
 
@@ -247,3 +256,230 @@ def train_inbetween(
     finally:
         log.close()
     return stats, interrupted
+
+
+#: The file in a model's folder.
+MODEL = "model.safetensors"
+KINDS = ("transformer", "rtn")
+
+
+@dataclass(frozen=True, eq=False)
+class InbetweenModel:
+    """A network ready to use.
+
+    Attributes:
+        names: joints, in order.
+        offsets: `(J, 3)` m, bones of the training set (the mean over its clips).
+        fps: frames per second.
+        longest: frames of the longest gap it was trained for.
+        past: frames before the gap that it was trained with at most.
+        meta: data set, seed, steps, how it was made.
+        example: tensors and JSON notes of a clip as `formats.own` packs it, which shows how the
+            skeleton stands; None where clips of other skeletons are not to be brought onto it.
+    """
+
+    kind: str
+    net: Between | RTN
+    names: tuple[str, ...]
+    offsets: Tensor
+    fps: float
+    longest: int
+    past: int = 10
+    meta: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    example: tuple[State, list[Any]] | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """The skeleton as the network sees it."""
+        return self.net.layout
+
+
+def make_net(kind: str, layout: Layout, config: BetweenConfig | RTNConfig, seed: int) -> Between | RTN:
+    """A fresh network with weights from the seed.
+
+    Raises:
+        PoiseError: another kind than transformer and rtn.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    if kind == "transformer" and isinstance(config, BetweenConfig):
+        return Between(layout, config, generator=generator)
+    if kind == "rtn" and isinstance(config, RTNConfig):
+        return RTN(layout, config, generator=generator)
+    raise PoiseError(f"there is no in-betweening network '{kind}' of such sizes", hint=f"Known: {KINDS}")
+
+
+def save_model(path: Path, model: InbetweenModel, half: bool = False) -> None:
+    """Writes a model atomically; `half` keeps weights in half precision (a few MB)."""
+    tensors = {k: v.half() if half else v for k, v in model.net.state_dict().items()}
+    meta = {
+        "kind": "inbetween model", "net": model.kind,
+        "config": dataclasses.asdict(model.net.config), "layout": dataclasses.asdict(model.layout),
+        "names": list(model.names), "fps": model.fps, "longest": model.longest, "past": model.past,
+        "meta": dict(model.meta),
+    }  # fmt: skip
+    tensors = prefixed("net", tensors) | {"offsets": model.offsets}
+    if model.example is not None:
+        tensors |= prefixed("example", model.example[0])
+        meta["example"] = model.example[1]
+    save_checkpoint(path, tensors, meta)
+
+
+def load_model(path: Path) -> InbetweenModel:
+    """The model in a file, or in a folder that holds `model.safetensors`; float32.
+
+    Raises:
+        PoiseError: there is none, it is damaged, or of another version.
+    """
+    path = path / MODEL if path.is_dir() else path
+    if not path.exists():
+        hint = "Train one with poise train inbetween"
+        raise PoiseError("there is no in-betweening model", path, hint)
+    tensors, meta = load_checkpoint(path)
+    if meta.get("kind") != "inbetween model":
+        raise PoiseError("the file is not an in-betweening model", path)
+    check_data(ModelMeta, meta, path)
+    hint = "Train it again"
+    if not (meta["fps"] > 0 and min(meta["longest"], meta["past"]) > 0):
+        raise PoiseError("its rate and the lengths that it fills must be above 0", path, hint)
+    try:
+        said = meta["layout"]
+        layout = Layout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
+        kind = BetweenConfig if meta["net"] == "transformer" else RTNConfig
+        said = dict(meta["config"])
+        if kind is BetweenConfig:
+            # Networks of earlier versions see no speeds and do not say so.
+            said.setdefault("speeds", False)
+        sizes = from_data(kind, said, path)
+        _check_sizes(sizes, tensors, path)
+        net = make_net(meta["net"], layout, sizes, 0)
+        load_module(net, {k: v.float() for k, v in tensors.items()}, "net")
+        example = None
+        if "example" in meta:
+            example = under("example", tensors), meta["example"]
+        return InbetweenModel(
+            meta["net"], net.eval(), tuple(meta["names"]), tensors["offsets"], meta["fps"],
+            meta["longest"], meta["past"], meta["meta"], example,
+        )  # fmt: skip
+    except PoiseError as problem:
+        raise PoiseError(problem.what, problem.where or path, problem.hint or hint) from None
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as problem:
+        raise PoiseError(f"the model is of another version ({problem})", path, hint) from None
+
+
+def _check_sizes(sizes: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Refuses sizes that its weights cannot have, before a network of them is made."""
+    held = sum(v.numel() for v in tensors.values())
+    for name, value in dataclasses.asdict(sizes).items():
+        numbers = cast("Sequence[Any]", value) if isinstance(value, list | tuple) else (value,)
+        for number in numbers:
+            if isinstance(number, int) and not 0 <= number <= held:
+                raise PoiseError(f"its weights are not those of a network with {name} = {value}", path)
+
+
+N = TypeVar("N", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """How a network is adapted to what it is asked."""
+
+    iterations: int = 5
+    """Passes over the test set, or over one sequence; choose them on validation."""
+    steps: Literal["whole", "minibatch"] = "whole"
+    """whole: one step of each pass, down the mean loss of all sequences. minibatch: a step after each
+    `batch` of them, as the paper's "several epochs on the whole test data" reads."""
+    lr: float = 1e-5
+    beta: float = 0.01
+    """Weight of the root's path."""
+    contacts: Literal["detached", "paper"] = "detached"
+    """detached: predicted contacts only weigh. paper: gradients flow through them as Eq. 1 is written,
+    so that predicting no contact at all also lowers the loss."""
+    optimizer: Literal["sgd", "adam"] = "adam"
+    batch: int = 128
+    """Sequences of which gradients are computed at once; with `steps="whole"` it changes memory and time
+    alone."""
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
+            raise PoiseError(
+                f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}"
+            )
+        validate(self)
+
+
+def contact_loss(feet: Tensor, contact: Tensor) -> Tensor:
+    """Eq. 1 `(N)` of foot joints `(N, T, F, 3)` m, frame 0 the last one seen, and their predicted
+    contacts `(N, T - 1, F)` in frames 1 .. T - 1."""
+    step = torch.diff(feet, dim=1).square().sum(-1)
+    # The root of zero has no slope, and a foot that stands still has none to give.
+    moved = torch.where(step > 0, step, torch.ones_like(step)).sqrt() * (step > 0)
+    return (moved * contact).sum((1, 2))
+
+
+def smoothness_loss(root: Tensor) -> Tensor:
+    """Eq. 2 `(N)` of root paths `(N, T, 3)` m, frame 0 the last one seen: the length of the path."""
+    step = torch.diff(root, dim=1).square().sum(-1)
+    return (torch.where(step > 0, step, torch.ones_like(step)).sqrt() * (step > 0)).sum(1)
+
+
+def test_loss(net: TransitionNet, known: Known, filled: Filled, config: Adaptation) -> Tensor:
+    """Eq. 4 `(N)` of transitions that a network gave."""
+    feet = list(net.layout.feet)
+    seen = joint_positions(net.layout, known.offsets, known.past_root[:, -1:], known.past_rot[:, -1:])
+    path = torch.cat((seen, filled.pos), 1)[:, :, feet]
+    contact = filled.contact if config.contacts == "paper" else filled.contact.detach()
+    root = torch.cat((known.past_root[:, -1:], filled.root), 1)
+    return contact_loss(path, contact) + config.beta * smoothness_loss(root)
+
+
+def adapt(
+    net: N,
+    known: Known,
+    length: int,
+    config: Adaptation | None = None,
+    on_iteration: Callable[[int, N, float], None] | None = None,
+) -> N:
+    """A copy of the network adapted to a whole test set of one length; the given one stays as it is.
+
+    With `steps="whole"` an iteration is one step down the mean loss of all sequences, so that as many
+    iterations do as much to a large set as to the small one that they were chosen on.
+
+    Args:
+        known: all sequences; the gradients of `config.batch` at a time are computed, in order.
+        on_iteration: called with its number (from 1), the network so far and the mean loss before it.
+
+    Raises:
+        TrainingError: the loss became infinite or not a number.
+    """
+    config = config or Adaptation()
+    own = copy.deepcopy(net)
+    params = [p for p in own.parameters() if p.requires_grad_(True) is p]
+    kind = torch.optim.Adam if config.optimizer == "adam" else torch.optim.SGD
+    optimizer = kind(params, lr=config.lr)
+    count, often = len(known.target_root), config.steps == "minibatch"
+    for iteration in range(1, config.iterations + 1):
+        total = 0.0
+        optimizer.zero_grad(set_to_none=True)
+        for low in range(0, count, config.batch):
+            part = Known(*(x[low : low + config.batch] for x in known))
+            own_count = len(part.target_root)
+            with torch.enable_grad():
+                losses = test_loss(own, part, own.fill(part, length), config)  # type: ignore[arg-type]
+                (losses.sum() / (own_count if often else count)).backward()
+            total += float(losses.detach().sum()) / count
+            if often:
+                _stepped(optimizer, total)
+                optimizer.zero_grad(set_to_none=True)
+        if not often:
+            _stepped(optimizer, total)
+        if on_iteration is not None:
+            on_iteration(iteration, own, total)
+    for p in params:
+        p.requires_grad_(False)
+    return own
+
+
+def _stepped(optimizer: torch.optim.Optimizer, loss: float) -> None:
+    if not loss < float("inf"):
+        raise TrainingError("the loss of the adaptation is not finite", hint="Lower its lr")
+    optimizer.step()

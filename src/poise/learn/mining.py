@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.state import State, take
+from poise.learn.checkpoint import State, take
 from poise.settings import validate
 
 Rule = Literal["uniform", "soft", "hard", "floor"]

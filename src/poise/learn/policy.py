@@ -14,9 +14,17 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import PolicyMeta, check_fits, load_checkpoint, save_checkpoint
-from poise.learn.state import State, load_module, prefixed
-from poise.nets import MLP, Composer, GaussianPolicy, ProgressiveNet, RunningNorm
+from poise.learn.checkpoint import (
+    PolicyMeta,
+    State,
+    check_fits,
+    load_checkpoint,
+    load_module,
+    prefixed,
+    save_checkpoint,
+)
+from poise.learn.composer import Composer
+from poise.learn.networks import MLP, GaussianPolicy, ProgressiveNet, RunningNorm
 from poise.settings import check_data
 
 
@@ -28,7 +36,7 @@ class PolicyBundle:
         norm: the observations' normaliser.
         policy: the Gaussian over actions.
         shape: what rebuilds the networks (hidden, activation, obs_clip and, but for a single
-            perceptron, its kind with what `poise.learn.progressive` adds).
+            perceptron, its kind with what `poise.learn.primitives` adds).
         meta: the checkpoint's data.
     """
 
@@ -237,7 +245,7 @@ class WarmStart:
 
     Attributes:
         policy: weights and observation statistics; a policy that is no plain perceptron, such as a
-            column or a composer of `poise.learn.progressive`, goes on learning itself, whatever sizes
+            column or a composer of `poise.learn.primitives`, goes on learning itself, whatever sizes
             and action noise the config has.
         critic: `PPO.state()` entries under "critic/" and "return_norm/", or None for an untrained
             critic.

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.learn.networks import GaussianPolicy, RunningNorm, gaussian_log_prob
 from poise.learn.protocols import Style, VecEnv
-from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
 
 
 class TrainingError(PoiseError):

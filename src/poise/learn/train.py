@@ -14,9 +14,18 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import TrainerMeta, check_fits, load_checkpoint, save_checkpoint
-from poise.learn.config import PPOConfig
-from poise.learn.lessons import LessonConfig, Student
+from poise.learn.checkpoint import (
+    State,
+    TrainerMeta,
+    check_fits,
+    load_checkpoint,
+    load_module,
+    prefixed,
+    save_checkpoint,
+    take,
+    under,
+)
+from poise.learn.clone import LessonConfig, Student
 from poise.learn.parallel import (
     ALONE,
     Comm,
@@ -27,10 +36,9 @@ from poise.learn.parallel import (
     together,
 )
 from poise.learn.policy import PolicyBundle, WarmStart
-from poise.learn.ppo import PPO, UpdateStats
+from poise.learn.ppo import PPO, PPOConfig, UpdateStats
 from poise.learn.protocols import Lessons, Style, VecEnv
 from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
-from poise.learn.state import State, load_module, prefixed, take, under
 from poise.machine import one_thread
 from poise.settings import check_data
 
@@ -98,12 +106,12 @@ class Trainer:
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
         warm_start: a policy that gives the first weights and observation statistics, or a `WarmStart`
             that may bring a critic and counts what it cost; the action noise stays the config's. A
-            column or a composer (`poise.learn.progressive`) is itself what learns, with its own noise.
+            column or a composer (`poise.learn.primitives`) is itself what learns, with its own noise.
         update_threads: with more than one, policy and critic are trained side by side, while the
             environment's own threads rest; the numbers are the same.
         comm: the processes that train together, each with a trainer and environments of its own but
             with the same seed, config and number of environments.
-        lessons: a teacher, from which the policy learns after each update, see `learn.lessons`, and how;
+        lessons: a teacher, from which the policy learns after each update, see `learn.clone`, and how;
             it is closed with `close`.
     """
 

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from poise.live.characters import FALLS, RETURNS, Endless, tensor
-from poise.live.config import LiveConfig
+from poise.live.commands import LiveConfig
 from poise.live.people import OntoBody, People, calibrated
-from poise.live.sinks.vmc import Own
 from poise.live.stream import Packet, margin
+from poise.live.vmc import Own
 from poise.live.world import World
 from poise.motion import Clip
-from poise.synth.generator import Kinematic
+from poise.synthesis.generator import Kinematic
 
 #: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
 #: nothing is caught up with.

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.goals.led import REST, WAITS_S
-from poise.env.recovery.entry import way_to_stand
-from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
+from poise.env.led import REST, WAITS_S
+from poise.env.recovery.clips import GetUpPlanner, mixed, smooth
+from poise.env.recovery.planner import way_to_stand
 from poise.live.people import Elsewhere
 from poise.metrics import LOST
-from poise.spatial.directions import facing, heading_angle
-from poise.synth.generator import Kinematic
+from poise.motion.rotations import facing, heading_angle
+from poise.synthesis.generator import Kinematic
 
 #: s in which one motion passes into another at least; m/s^2 with which the root speeds up at most, on
 #: average.

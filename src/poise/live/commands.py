@@ -1,5 +1,5 @@
-"""What pages and programs may send, checked before anything else sees it: one JSON document a message,
-small, flat, of the kinds below and no others. The protocol is described in docs/live.md."""
+"""What pages and programs may send, checked before anything else sees it; settings of live motion. The
+protocol is described in docs/live.md."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
+from poise.settings import validate
 
 #: Version of the protocol; bytes and depth of a message; joints of a skeleton.
 VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
@@ -222,3 +224,36 @@ def turned(values: np.ndarray, up: str) -> np.ndarray:
         values = values * ([1.0] * (values.shape[-1] - 2) + [-1.0, -1.0])
     head, tail = values[..., :-3], values[..., -3:]
     return np.concatenate((head, tail[..., [2, 0, 1]]), -1)
+
+
+@dataclass(frozen=True)
+class LiveConfig:
+    """How live motion is followed.
+
+    Attributes:
+        characters: in one world.
+        buffer_s: s, 0 to 0.4: half of it, and 0.05 s at least, evens out how packets come; the rest is
+            known ahead. With 0 the goal is extrapolated.
+        lookahead: how many characters look ahead before they act, the first ones.
+        noise: 0 to 1, what is added to goals as a video estimator errs: 0.1 rad and 30 mm for 1,
+            which wander within 0.3 s.
+        seed: of the noise and of lookahead.
+    """
+
+    characters: int = 1
+    buffer_s: float = 0.1
+    lookahead: int = 0
+    noise: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if not 1 <= self.characters <= 16:
+            raise PoiseError(f"characters must lie in 1 to 16, got {self.characters}", "LiveConfig")
+        if not 0 <= self.buffer_s <= 0.4:
+            raise PoiseError(f"buffer_s must lie in 0 to 0.4 s, got {self.buffer_s:g}", "LiveConfig")
+        if not 0 <= self.lookahead <= self.characters:
+            what = f"lookahead must lie in 0 to {self.characters} characters, got {self.lookahead}"
+            raise PoiseError(what, "LiveConfig")
+        if not 0 <= self.noise <= 1:
+            raise PoiseError(f"noise must lie in 0 to 1, got {self.noise:g}", "LiveConfig")

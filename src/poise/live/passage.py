@@ -1,8 +1,4 @@
-"""Frame by frame from one skeleton onto another, in a fraction of a millisecond.
-
-It is `kin.retarget.Passage.transfer` without the planting of feet, which needs what comes later; the
-tests hold the two together.
-"""
+"""Frame by frame from one skeleton onto another, in a fraction of a millisecond."""
 
 from __future__ import annotations
 
@@ -13,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from poise.body import BodyTable
-from poise.kin.retarget.passage import Passage, _places
-from poise.live import quats as q
+from poise.kinematics.retarget.passage import Passage, _places
+from poise.live.quats import between, conj, matrix, mul, normalized, rotate, slerp
 from poise.motion import Clip, Skeleton
-from poise.motion.joint_map import SHARED
-from poise.motion.roles import SIDES
+from poise.motion.roles import SHARED, SIDES
 
 
 class _Chain(NamedTuple):
@@ -58,7 +53,7 @@ class FramePassage:
             at = [k for k, j in enumerate(joints.tolist()) if j not in done]
             if at:
                 turns = [
-                    p.there.above[j] if j in above else q.between(self._there[parent], self._there[j])
+                    p.there.above[j] if j in above else between(self._there[parent], self._there[j])
                     for j, parent in zip(joints[at].tolist(), parents[at].tolist(), strict=True)
                 ]
                 self._hanging.append((joints[at], parents[at], np.stack(turns)))
@@ -72,18 +67,18 @@ class FramePassage:
 
     def turned(self, root_pos: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same for world rotations `(J, 4)` of the source."""
-        turned = q.mul(world, q.conj(self._here))
+        turned = mul(world, conj(self._here))
         out = np.empty((len(self.target), 4))
         onto, of = self._direct
-        out[onto] = q.mul(turned[of], self._there[onto])
+        out[onto] = mul(turned[of], self._there[onto])
         if len(self._bent):
-            bent = q.slerp(turned[self._low], turned[self._high], self._shares)
-            out[self._bent] = q.mul(bent, self._there[self._bent])
+            bent = slerp(turned[self._low], turned[self._high], self._shares)
+            out[self._bent] = mul(bent, self._there[self._bent])
         if self._first is not None:
             out[0] = self._first
         for joints, parents, turns in self._hanging:
-            out[joints] = q.mul(out[parents], turns)
-        out = q.normalized(out)
+            out[joints] = mul(out[parents], turns)
+        out = normalized(out)
         middle = self._middle(0, root_pos, world)
         root = middle + (self.factor - 1.0) * (middle - self.centre) - self._middle(1, np.zeros(3), out)
         return root, out
@@ -91,7 +86,7 @@ class FramePassage:
     def _middle(self, side: int, root: np.ndarray, world: np.ndarray) -> np.ndarray:
         """The middle between the hip joints of the source (0) or target (1)."""
         joints, arms = self._ways[side]
-        return root + q.rotate(world[joints], arms).sum(0)
+        return root + rotate(world[joints], arms).sum(0)
 
 
 def _way(skeleton: Skeleton, ends: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -131,14 +126,14 @@ def world_of(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
     """World rotations `(J, 4)` of local ones."""
     out = rot.copy()
     for joints, above in doublings(tuple(skeleton.parents)):
-        out[joints] = q.mul(out[above], out[joints])
+        out[joints] = mul(out[above], out[joints])
     return out
 
 
 def local_of(skeleton: Skeleton, world: np.ndarray) -> np.ndarray:
     """Local rotations `(J, 4)` of those in the world."""
     parents = np.array(skeleton.parents)
-    out = q.between(world[np.maximum(parents, 0)], world)
+    out = between(world[np.maximum(parents, 0)], world)
     out[0] = world[0]
     return out
 
@@ -149,11 +144,11 @@ def place_of(
     """m, where the last joint of a path from the root is."""
     if len(path) < 2:
         return root
-    return root + q.rotate(world[list(path[:-1])], skeleton.offsets[list(path[1:])]).sum(0)
+    return root + rotate(world[list(path[:-1])], skeleton.offsets[list(path[1:])]).sum(0)
 
 
 def _chains(p: Passage) -> list[_Chain]:
-    """Spine, neck and head, as `kin.retarget.passage` shares their bend out."""
+    """Spine, neck and head, as `kinematics.retarget.passage` shares their bend out."""
     joints, out = p.joints, list[_Chain]()
     hips = joints.source.joint("hips")
     carrier = chest = hips if hips is not None else 0
@@ -219,9 +214,9 @@ class Hinges:
         out = np.empty(7 + self.count)
         out[:3] = place_of(self.skeleton, self._pelvis, root, world)
         out[3:7] = world[self._pelvis[-1]]
-        rel = q.between(world[self._anchors], world[self._joints])
-        local = q.mul(q.between(self._frame, q.between(self._rest, rel)), self._frame)
-        m, angles = q.matrix(local), np.zeros(self.count)
+        rel = between(world[self._anchors], world[self._joints])
+        local = mul(between(self._frame, between(self._rest, rel)), self._frame)
+        m, angles = matrix(local), np.zeros(self.count)
         last = np.zeros(self.count) if before is None else before
         k, axis, at = self._single
         angles[at] = 2.0 * np.arctan2(local[k, 1 + axis], local[k, 0])

@@ -13,9 +13,9 @@ import numpy as np
 
 from poise.body import Humanoid
 from poise.errors import PoiseError
-from poise.kin import RetargetConfig, place_on_body
-from poise.kin.fading import FadingFilter
-from poise.kin.hinges import wrapped
+from poise.kinematics import RetargetConfig, place_on_body
+from poise.kinematics.coords import wrapped
+from poise.kinematics.stream_noise import FadingFilter
 from poise.live import quats as q
 from poise.live.passage import FramePassage, Hinges, doublings, world_of
 from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, Pose, Tremble, leapt

@@ -14,16 +14,15 @@ import numpy as np
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
-from poise.kin.fading import FadingFilter, of_points
-from poise.kin.retarget.keypoint_body import PointBody
-from poise.kin.retarget.keypoint_stream import Gaps
+from poise.formats.point_fit import fit_clip
+from poise.kinematics.retarget.keypoint_goal import Gaps, PointBody
+from poise.kinematics.stream_noise import FadingFilter, of_points
 from poise.live.people import FEWEST, FORGET_S, STAND_S, STILL_M
-from poise.live.sources.stream import Frame
+from poise.live.sources import Frame
 from poise.live.stream import PEOPLE, Inbox, Packet, Tremble
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing
-from poise.motion.points.fit import fit_clip
 
 #: s between frames that are fitted at least, frames that wait, m/s beyond which a keypoint is missing.
 APART_S, WAIT, MAX_SPEED = 0.024, 64, 25.0

@@ -24,21 +24,18 @@ from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
 from poise.live.aims import Aims
 from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
-from poise.live.config import LiveConfig
-from poise.live.page.guard import Guard
+from poise.live.commands import LiveConfig
 from poise.live.page.server import PageServer, as_json, packed
 from poise.live.people import STAND, Steady
 from poise.live.points import PointFit
-from poise.live.sinks.record import Recorder
-from poise.live.sinks.vmc import OwnPuppet, VmcSink
-from poise.live.sources.file import FileSource
-from poise.live.sources.sockets import StreamDoor
-from poise.live.sources.vmc import VmcSource
+from poise.live.record import Recorder
+from poise.live.sockets import Guard, StreamDoor
+from poise.live.sources import FileSource
 from poise.live.stream import Inbox, Tremble
-from poise.live.vrm import NEEDED, PARENTS
+from poise.live.vmc import NEEDED, PARENTS, OwnPuppet, VmcSink, VmcSource
 from poise.live.world import Seen, World
 from poise.motion import Clip
-from poise.synth.generator import Kinematic
+from poise.synthesis.generator import Kinematic
 
 #: Commands that wait at most.
 MOST_ORDERS = 256

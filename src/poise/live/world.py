@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from poise.control import Compliance
-from poise.env.goals import StreamGoal
-from poise.env.goals.goal import Goal
+from poise.env.goal import Goal
 from poise.env.plugins import Felt, Plugin
-from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.recovery.clips import GetUpPlanner
+from poise.env.stream import StreamGoal
 from poise.env.yielding import Yielding
 from poise.errors import PoiseError
 from poise.jobs.track.placement import place

@@ -1,10 +1,9 @@
 """Pure functions that score motion: tracking, plausibility, help; definitions in docs/results.md."""
 
-from poise.metrics.help import HelpAudit, help_audit
 from poise.metrics.inbetween import l2p, l2q, npss, physics
-from poise.metrics.masking import masked_mean, masked_quantile, span_mask
 from poise.metrics.plausibility import (
     Deviation,
+    HelpAudit,
     ballistic,
     detail,
     deviations,
@@ -12,6 +11,7 @@ from poise.metrics.plausibility import (
     floating,
     foot_contacts,
     foot_slide,
+    help_audit,
     jerk,
     penetration,
     physdiff_float,
@@ -21,17 +21,23 @@ from poise.metrics.plausibility import (
     uhc_penetration,
     uhc_skate,
 )
-from poise.metrics.posture import LASTING_S, fallen, first_lasting, off_feet
 from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
 from poise.metrics.tracking import (
+    LASTING_S,
     LOST,
     RULES,
     SuccessRule,
     acceleration_error,
+    fallen,
+    first_lasting,
     has_lost,
+    masked_mean,
+    masked_quantile,
     mpjpe_global,
     mpjpe_pa,
     mpjpe_root,
+    off_feet,
+    span_mask,
     success,
     success_rule,
     velocity_error,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.spatial import normalize, quat_mul, quat_rotate
+from poise.motion.rotations import normalize, quat_mul, quat_rotate
 
 PIECE = 4096
 """Frames in which geoms are placed at once."""

@@ -1,11 +1,8 @@
-"""How closely a motion follows its reference: position, velocity and acceleration errors, success.
-
-Positions are `(..., T, B, 3)` in metres, world, Z up; errors come out in millimetres per frame.
-The definitions are those of UHC's and PHC's evaluation (Luo et al. 2021, 2023).
-"""
+"""How closely a motion follows its reference: position, velocity and acceleration errors, success."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -15,7 +12,8 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
-from poise.spatial import best_rotation
+from poise.metrics.shapes import Shapes, geom_heights
+from poise.motion.rotations import best_rotation
 
 MM = 1000.0
 PHC_FPS = 30.0
@@ -200,3 +198,100 @@ def success(
     failed = bad.any(-1)
     first = torch.where(failed, bad.long().argmax(-1), torch.full_like(lengths.long(), -1))
     return Outcome(~failed & (lengths > 0), first)
+
+
+UPRIGHT_DEG = 45.0
+"""Degrees from the vertical up to which a trunk is upright, in the reference."""
+FALLEN_DEG = 60.0
+"""Degrees beyond which a character's trunk is not, where the reference's is."""
+HEAD_SHARE = 0.8
+"""Of the reference's height of the head; kneeling it is at 0.7 of standing."""
+FOOT_M = 0.05
+"""m; a reference is on its feet where one of them is this near the ground."""
+OFF_M = 0.1
+"""m; a character is off its feet where all of them are higher."""
+LASTING_S = 0.5
+"""s; shorter spells are a stumble or a hop."""
+
+
+def fallen(pos: Tensor, ref: Tensor, head: int, root: int = 0) -> Tensor:
+    """Frames `(..., T)` in which the reference is upright and the character is not.
+
+    With d the way from the root to the head and z up, the reference is upright where the angle of d and
+    z is at most `UPRIGHT_DEG`. The character has fallen there if its own angle is above `FALLEN_DEG`, or
+    its head lower than `HEAD_SHARE` of the reference's.
+
+    Args:
+        pos, ref: `(..., T, B, 3)` m.
+    """
+    lean, own = (_lean(x[..., head, :] - x[..., root, :]) for x in (ref, pos))
+    low = pos[..., head, 2] < HEAD_SHARE * ref[..., head, 2]
+    return (lean <= math.radians(UPRIGHT_DEG)) & ((own > math.radians(FALLEN_DEG)) | low)
+
+
+def off_feet(
+    pos: Tensor, quat: Tensor, ref: Tensor, ref_quat: Tensor, shapes: Shapes, feet: tuple[int, ...]
+) -> Tensor:
+    """Frames `(..., T)` in which the reference has a foot within `FOOT_M` of the ground, and the
+    character none within `OFF_M`.
+
+    Args:
+        pos, ref: `(..., T, B, 3)` m. quat, ref_quat: `(..., T, B, 4)` wxyz.
+        feet: the bodies that are feet; their shapes tell heights.
+    """
+    own = shapes.of_bodies(feet)
+    height, stands = (geom_heights(*x, own).amin(-1) for x in ((pos, quat), (ref, ref_quat)))
+    return (stands <= FOOT_M) & (height > OFF_M)
+
+
+def first_lasting(bad: Tensor, fps: float) -> Tensor:
+    """`(...)` long, the first frame of a spell of `bad (..., T)` that lasts `LASTING_S`, else -1."""
+    frames = max(1, round(LASTING_S * fps))
+    if bad.shape[-1] < frames:
+        return torch.full(bad.shape[:-1], -1, dtype=torch.long, device=bad.device)
+    lasting = bad.unfold(-1, frames, 1).all(-1)
+    return torch.where(lasting.any(-1), lasting.long().argmax(-1), -1)
+
+
+def _lean(way: Tensor) -> Tensor:
+    """Angle (rad) of vectors `(..., 3)` and the vertical."""
+    return torch.atan2(way[..., :2].norm(dim=-1), way[..., 2])
+
+
+def span_mask(mask: Tensor, order: int) -> Tensor:
+    """Which of the `T - order` differences of order `order` use valid frames only.
+
+    mask: `(..., T)` bool. Returns `(..., T - order)` bool, aligned with `torch.diff(x, n=order)`.
+    """
+    frames = mask.shape[-1]
+    out = mask[..., : max(frames - order, 0)]
+    for k in range(1, order + 1):
+        out = out & mask[..., k : max(frames - order, 0) + k]
+    return out
+
+
+def masked_mean(
+    x: Tensor, mask: Tensor | None = None, dim: int | tuple[int, ...] | None = None
+) -> Tensor:
+    """Mean of `x` where `mask` (of the same shape) holds; NaN where nothing is valid.
+
+    Values under a false mask may be anything, NaN too. `dim=None` reduces everything.
+    """
+    dims = tuple(range(x.ndim)) if dim is None else dim
+    if mask is None:
+        mask = torch.ones_like(x, dtype=torch.bool)
+    if mask.shape != x.shape:
+        raise PoiseError(f"the mask has shape {tuple(mask.shape)}, the values {tuple(x.shape)}")
+    total = torch.where(mask, x, torch.zeros_like(x)).sum(dims)
+    return total / mask.sum(dims)
+
+
+def masked_quantile(x: Tensor, q: float, mask: Tensor | None = None) -> Tensor:
+    """The quantile `q` in [0, 1] of all valid values, linear between neighbours; NaN without any."""
+    values = (x.reshape(-1) if mask is None else x[mask]).sort().values
+    if values.numel() == 0:
+        return x.new_tensor(float("nan"))
+    place = q * (values.numel() - 1)
+    low = int(place)
+    high = min(low + 1, values.numel() - 1)
+    return values[low] + (place - low) * (values[high] - values[low])

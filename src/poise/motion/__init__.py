@@ -1,9 +1,7 @@
-"""Motion data: skeletons, frozen clips, libraries of clips, and the files they come from."""
+"""Motion data: skeletons, frozen clips, libraries of clips."""
 
-from poise.motion.clip import Clip, ClipLibrary
-from poise.motion.edits import ground_shift, resample, shifted, trim
+from poise.motion.clip import Clip, ClipLibrary, ground_shift, resample, shifted, trim
 from poise.motion.info import describe, standing_height
-from poise.motion.io import read_clip, write_bvh, write_clip
 from poise.motion.roles import Role, Roles, find_roles
 from poise.motion.skeleton import Channel, Skeleton, Source
 
@@ -18,11 +16,8 @@ __all__ = [
     "describe",
     "find_roles",
     "ground_shift",
-    "read_clip",
     "resample",
     "shifted",
     "standing_height",
     "trim",
-    "write_bvh",
-    "write_clip",
 ]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError, did_you_mean
-from poise.spatial import forward_kinematics
+from poise.motion.rotations import forward_kinematics
 
 #: Bones that differ by less (m) are the same; files round their numbers.
 SAME_M = 1e-4

@@ -3,11 +3,9 @@
 from poise.plan.expert import Expert, ExpertConfig, Plan, make_plan
 from poise.plan.guide import Guide
 from poise.plan.lookahead import Lookahead, LookaheadConfig
-from poise.plan.lqr_teacher import LqrTeacher
 from poise.plan.sampling import SamplingConfig, SamplingControl, SamplingResult
 from poise.plan.teacher import LookaheadTeacher, TeacherConfig
-from poise.plan.trajopt import TrajectoryOptimizer
-from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
+from poise.plan.trajopt import LqrTeacher, Trajectories, TrajectoryOptimizer, TrajOptConfig, TrajOptStats
 
 __all__ = [
     "Expert",

@@ -18,10 +18,17 @@ from torch import Tensor
 
 from poise.control import ExplicitResidual, ImplicitResidual, Residual
 from poise.env.frame import Pose
-from poise.env.goals.goal import Goal
+from poise.env.goal import Goal
 from poise.env.reference import Reference
+from poise.motion.rotations import (
+    heading_quat,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    quat_rotate_inv,
+    quat_to_rotvec,
+)
 from poise.sim import SimState
-from poise.spatial import heading_quat, quat_conj, quat_mul, quat_rotate, quat_rotate_inv, quat_to_rotvec
 
 
 @dataclass(frozen=True)

@@ -1,37 +1,193 @@
-"""Lookahead: before it acts, a controller simulates what a policy and small changes of it would do.
-
-    control = Lookahead(copies, policy, value)
-    control.watch(env)
-    simulate(env, control, obs, steps)
-
-Every few control steps the worlds of `copies` become copies of the character as it stands. Each acts as
-the policy plus an offset of its own, is simulated some steps ahead, and costs
-
-    c = - sum_h gamma^h r_h - gamma^H V(o_H) + prices,
-
-with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`); each
-control step in which the motion is lost costs more than all of that. What the best of them began with
-is done. Nothing is trained, nothing helps, and the goal is seen no farther
-than it tells: a clip its frames, a stream or a generator what it knows.
-"""
+"""Lookahead: before it acts, a controller simulates what a policy and small changes of it would do."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from poise.env.env import ImitationEnv
-from poise.env.snapshot import Snapshot
+from poise.env.env import ImitationEnv, Snapshot
 from poise.env.task import Acts
 from poise.errors import PoiseError
+from poise.kinematics.forward import shapes_of
 from poise.machine import one_thread
-from poise.plan.candidates import Candidates, Changes
+from poise.metrics import has_lost
+from poise.metrics.plausibility import foot_contacts, jerk
+from poise.metrics.shapes import Shapes, foot_points
 from poise.plan.sampling import draw_offsets
+
+#: m/s^3, the mean jerk below which a reference counts as calm.
+CALM = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class Roughness:
+    """How roughly K motions of T frames go, by the score card's own measures.
+
+    Attributes:
+        jerk: `(K, T')` m/s^3, mean over the bodies, from frame to frame.
+        slide: `(K, T - 1)` m/s with which points of the soles that touch the ground move along it,
+            summed over the points and divided by half their number.
+    """
+
+    jerk: Tensor
+    slide: Tensor
+
+    @classmethod
+    def of(
+        cls, pos: Tensor, quat: Tensor, past: Tensor, shapes: Shapes, feet: Sequence[int], rate_hz: float
+    ) -> Roughness:
+        """Measures predictions.
+
+        Args:
+            pos: `(K, T, B, 3)` m, world positions of the bodies, the first where they are now.
+            quat: `(K, T, B, 4)` wxyz.
+            past: `(K, k, B, 3)` m, up to three frames before them; `(1, k, B, 3)` where all share them.
+            shapes: the solids of the bodies.
+            feet: indices of the feet among the bodies.
+            rate_hz: frames a second.
+        """
+        whole = torch.cat((past.expand(len(pos), -1, -1, -1), pos), 1)
+        speed, contact = foot_contacts(foot_points(pos, quat, shapes, feet), rate_hz)
+        slide = (speed * contact).sum(-1) / 1000.0 / (speed.shape[-1] / 2)
+        few = whole.shape[1] < 4
+        return cls(slide[:, :0] if few else jerk(whole, rate_hz), slide)
+
+    def price(self, reference: Roughness, jerk_price: float, slide_price: float) -> Tensor:
+        """`(K,)`, what these motions cost beside references `(G, ...)`, each that of K / G of them,
+
+            jerk_price sum_t j_t / max(mean j_ref, CALM) + slide_price sum_t max(0, s_t - mean s_ref),
+
+        with the jerk j and the slide s, so that a leap may be as jerky as a leap is, and standing feet
+        stand.
+        """
+        if not self.slide.shape[1]:
+            return torch.zeros(len(self.slide))
+        each = len(self.slide) // len(reference.slide)
+        slid = reference.slide.mean(1, keepdim=True).repeat_interleave(each, 0)
+        price = slide_price * (self.slide - slid).clamp_min(0.0).sum(1)
+        if self.jerk.shape[1]:
+            source = torch.full((len(price),), CALM)
+            if reference.jerk.shape[1]:
+                source = reference.jerk.mean(1).clamp_min(CALM).repeat_interleave(each)
+            price = price + jerk_price / source * self.jerk.sum(1)
+        return price
+
+
+#: What each control step costs in which a copy is lost.
+LOSS = 100.0
+
+
+class Changes(NamedTuple):
+    """What N copies change of a policy's action pi: a_h = lerp(much pi(o_h) + offset_h, a_(h-1), keep).
+
+    Attributes:
+        offsets: `(N, H, A)` rad.
+        keep: `(N, 1)`, share of the last action that actions keep, in place of the environment's own
+            (`TaskConfig.filter`).
+        much: `(N, 1)`, share of the policy's own action.
+    """
+
+    offsets: Tensor
+    keep: Tensor
+    much: Tensor
+
+
+class Tried(NamedTuple):
+    """What N copies of G worlds came to.
+
+    Attributes:
+        cost: `(N,)`, c = - sum_h gamma^h r_h - gamma^H V(o_H), and `LOSS` for each step that is lost.
+        lost: `(N,)` bool, whether one was.
+        ended: `(G,)` bool, whether a world's goal ended before the horizon.
+        rough: how rough the copies were.
+        source: how rough their goals were, `(G, ...)`.
+        off: `(N, T, B)` m, how far each body was from its goal, from the first step on.
+    """
+
+    cost: Tensor
+    lost: Tensor
+    ended: Tensor
+    rough: Roughness
+    source: Roughness
+    off: Tensor
+
+
+class Candidates:
+    """Simulates what is tried; N copies are of G worlds, N / G of each one after another.
+
+    Args:
+        copies: an environment of N worlds without ends and automatic restarts, with rewards
+            (`Imitation.bare`).
+        policy: acts on its observations.
+        value: the return `(N,)` that the policy is still to earn, of observations `(N, O)`.
+        discount: gamma.
+    """
+
+    def __init__(
+        self,
+        copies: ImitationEnv,
+        policy: Acts,
+        value: Callable[[Tensor], Tensor],
+        discount: float,
+    ):
+        self.copies, self.policy, self.value, self.discount = copies, policy, value, discount
+        humanoid = copies.goal.humanoid
+        self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
+        self.steps = 0
+
+    def tried(self, snapshot: Snapshot, changes: Changes, past: Tensor, groups: int = 1) -> Tried:
+        """What the copies come to from a snapshot of one world or of N.
+
+        Args:
+            past: `(1 or N, k, B, 3)` m, the bodies in the frames before; with none nothing is kept of
+                an action before the first.
+            groups: G.
+        """
+        env, n = self.copies, self.copies.num_envs
+        own = slice(None, None, n // groups)
+        obs, start = env.restore(snapshot), env.pose()
+        pos, quat = [start.pos.clone()], [start.quat.clone()]
+        aim = env.goal_pose()
+        ref_pos, ref_quat = [aim.pos[own].clone()], [aim.quat[own].clone()]
+        cost, lost = torch.zeros(n), torch.zeros(n, dtype=torch.bool)
+        ended = torch.zeros(groups, dtype=torch.bool)
+        # Nothing came before the first action of an episode.
+        keep = changes.keep * (env.age > 0).unsqueeze(1) if past.shape[1] else 0.0 * changes.keep
+        factor = 1.0
+        for offset in changes.offsets.unbind(1):
+            # The last frame of a clip is a goal that is reached.
+            ended |= env.goal.layout.place(env.goal.now()).end[own] > 0
+            if bool(ended.all()):
+                break
+            action = torch.lerp(changes.much * self.policy.act(obs) + offset, env.action, keep)
+            keep = changes.keep
+            obs = env.step(env.unfiltered(action)).final_obs
+            pose = env.pose()
+            pos.append(pose.pos.clone())
+            quat.append(pose.quat.clone())
+            aim = env.goal_pose()
+            ref_pos.append(aim.pos[own].clone())
+            ref_quat.append(aim.quat[own].clone())
+            lost |= has_lost(pose.pos, aim.pos)
+            cost, factor = cost - factor * env.imitation + LOSS * lost, factor * self.discount
+        cost = cost - factor * self.value(obs)
+        self.steps += n * (len(pos) - 1)
+        rough, source = (
+            Roughness.of(
+                torch.stack(p, 1), torch.stack(q, 1), was, self._shapes, self._feet, env.goal.rate_hz
+            )
+            for p, q, was in ((pos, quat, past), (ref_pos, ref_quat, past[:1, :0]))
+        )
+        each = n // groups
+        aims = torch.stack(ref_pos[1:] or ref_pos, 1).repeat_interleave(each, 0)
+        off = (torch.stack(pos[1:] or pos, 1) - aims).norm(dim=-1)
+        return Tried(cost, lost, ended, rough, source, off)
+
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4

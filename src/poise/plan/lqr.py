@@ -18,7 +18,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.sim.cpu import CpuBackend
-from poise.sim.tangent import difference, displaced
+from poise.sim.mechanics import difference, displaced
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from poise.env.env import ImitationEnv
 from poise.env.frame import Pose
 from poise.env.task import Acts
 from poise.errors import PoiseError
-from poise.plan.candidates import Candidates, Changes
-from poise.plan.lookahead import PAST
+from poise.plan.lookahead import PAST, Candidates, Changes
 from poise.plan.sampling import draw_offsets
 from poise.settings import validate
 

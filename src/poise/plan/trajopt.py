@@ -1,31 +1,265 @@
-"""Trajectory optimisation: a motion near each clip that physics allows without help, with feedback.
-
-An expert that needs no residual force. It is found by iLQR along all clips at once (Tassa et al. 2012),
-with three things that the motion of a human on stiff contacts asks for:
-
-- the linear model is taken over differences of about a tenth of a radian (`plan.lqr`);
-- at first a wrench on the root may help; its price rises wherever the character is near its reference:
-  the curriculum of residual forces (Skeleton2Humanoid Eq. 9), for each shooting segment by itself;
-- the step is chosen for each segment of some seconds by itself, among rollouts that are made side by
-  side (multiple shooting), since one hard motion bin must not hold up a minute of motion.
-"""
+"""Trajectory optimisation: a motion near each clip that physics allows without help, and its teacher."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
+from poise.env.env import ImitationEnv
 from poise.env.reference import Reference
 from poise.errors import PoiseError
-from poise.plan.expert import make_plan
-from poise.plan.lqr import Regulator, linearise, regulate
-from poise.plan.shooting import Segments, best_steps, segments
-from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
+from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
+from poise.plan.expert import ExpertConfig, make_plan
+from poise.plan.lqr import Regulator, driven, linearise, regulate
 from poise.sim import CpuBackend, SimConfig, alone, difference
+
+
+@dataclass(frozen=True)
+class TrajOptConfig:
+    """How trajectories are optimised.
+
+    Attributes:
+        iterations: number of iterations; 0 optimises nothing.
+        sizes: rad, of the differences in the first and in the last iteration, see `plan.lqr`.
+        segment_s: seconds of a shooting segment; each segment chooses its own step.
+        place_m: m, error of the root's place that costs 1.
+        turn: rad, error of the root's attitude that costs 1.
+        joint: rad, error of a joint that costs 1.
+        speed: m/s, error of the root's velocity that costs 1.
+        spin: rad/s, error of the root's angular velocity that costs 1.
+        joint_speed: rad/s, error of a joint's velocity that costs 1.
+        effort: rad, deviation of a joint's target that costs 1.
+        help_n: N, force on the root that costs 1 at first.
+        help_nm: N m, torque on the root that costs 1 at first.
+        less: factor on the help after an iteration in segments with a mean error cost below `good`.
+        least: share at which the help ends, next to nothing; the trajectories themselves are without
+            help.
+        good: mean error cost of a segment below which its help becomes less.
+        bad: mean error cost of a segment above which its help comes back, up to the whole.
+        astray: mean error cost from which on a segment begins again on its reference, with the help
+            of three iterations ago.
+        steps: step sizes of the line search, of which the best is taken.
+        lost: error of a whole body, in units of what costs 1, beyond which a step is no choice.
+        blur: the feedback of a frame is the mean over so many frames before and after it; from frame to
+            frame it jumps, which a network learns last.
+        plan: the scripted expert with which it begins.
+    """
+
+    iterations: int = 11
+    sizes: tuple[float, float] = (0.1, 0.065)
+    segment_s: float = 2.0
+    place_m: float = 0.3
+    turn: float = 0.4
+    joint: float = 0.5
+    speed: float = 1.5
+    spin: float = 4.0
+    joint_speed: float = 8.0
+    effort: float = 0.5
+    help_n: float = 100.0
+    help_nm: float = 30.0
+    less: float = 0.6
+    least: float = 0.02
+    good: float = 4.0
+    bad: float = 10.0
+    astray: float = 25.0
+    steps: tuple[float, ...] = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
+    lost: float = 1.2
+    blur: int = 3
+    plan: ExpertConfig = field(default_factory=ExpertConfig)
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0 or not 0 < self.less < 1 or min(*self.sizes, self.segment_s) <= 0:
+            what = "iterations must not be negative, less lie in (0, 1), sizes and segment_s be above 0"
+            raise PoiseError(what, "TrajOptConfig")
+        if 0.0 not in self.steps:
+            raise PoiseError(
+                "one of the steps must be 0, with which a trajectory stays", "TrajOptConfig"
+            )
+
+    def size(self, iteration: int) -> float:
+        """Size of the differences at an iteration, rad; it falls geometrically."""
+        first, last = self.sizes
+        return first * (last / first) ** min(1.0, iteration / max(1, self.iterations - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """One optimised trajectory per clip; row r stands where row r of the reference does.
+
+    Attributes:
+        qpos: `(F, nq)` float64.
+        qvel: `(F, nv)` float64.
+        target: `(F, n)` rad float32, servo targets.
+        feedback: `(F, n, 2 nv)` float32, how the targets change with the deviation (`sim.difference`,
+            then velocities).
+        price: `(2 nv)`, what the squares of deviations cost in the optimisation.
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    target: Tensor
+    feedback: Tensor
+    price: Tensor
+
+
+@dataclass(frozen=True)
+class TrajOptStats:
+    """What an iteration came to, over all frames.
+
+    Attributes:
+        iteration: its number, from 1.
+        error_m: mean distance of the root from the reference, m.
+        help_n: mean force that still helps, N.
+        unhelped: share of the frames where help has ended.
+        seconds: of all iterations so far.
+    """
+
+    iteration: int
+    error_m: float
+    help_n: float
+    unhelped: float
+    seconds: float
+
+
+#: rad that a target may be away from the reference; rad/s beyond which a world has gone bad.
+REACH, WILD = 2.5, 200.0
+#: What is paid for a state that is not finite, and for one that is lost.
+AWFUL, LOST = 1e4, 1e9
+
+
+@dataclass(eq=False)
+class Segments:
+    """Rows of some motions, one after another: their trajectory, which is changed, and what judges it.
+
+    Attributes:
+        qpos: `(F, nq)`, positions of the trajectory.
+        qvel: `(F, nv)`, its velocities.
+        action: `(F, nu + 6)`, its actions, see `lqr.linearise`.
+        rest: `(F, nu + 6)`, actions of no effort.
+        ahead: `(F, nu)` rad, hinge angles of the reference's next rows.
+        ref_qpos: `(F, nq)`, positions of the reference.
+        ref_qvel: `(F, nv)`, its velocities.
+        share: `(F,)`, share of the help at each row.
+        last: `(F,)` bool, whether the row ends a motion.
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    action: Tensor
+    rest: Tensor
+    ahead: Tensor
+    ref_qpos: Tensor
+    ref_qvel: Tensor
+    share: np.ndarray
+    last: np.ndarray
+
+
+def segments(lengths: np.ndarray, size: int, shift: int) -> np.ndarray:
+    """`(S, 2)` first row and end of segments of about `size` steps; the first of a motion has `shift`
+    of them.
+
+    The end of a segment is the row where the next begins, or the last of its motion.
+    """
+    out, at = [], 0
+    for length in lengths.tolist():
+        steps = length - 1
+        cuts = [x for x in range(shift or size, steps - size // 4, size) if x >= size // 4]
+        edges = [0, *cuts, steps]
+        out += [(at + a, at + b) for a, b in pairwise(edges)]
+        at += length
+    return np.array(out)
+
+
+@torch.no_grad()
+def best_steps(
+    model: mujoco.MjModel,
+    path: Segments,
+    gains: Regulator,
+    cut: np.ndarray,
+    steps: Sequence[float],
+    lost: float,
+    prices: tuple[np.ndarray, float],
+    drive: tuple[Tensor, int, int],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rolls all segments `cut (S, 2)` out with all steps at once, and keeps the best of each in `path`.
+
+    A rollout acts by u = u_path + step k + K d and pays what `regulate` minimises, with the value
+    function for where it ends. A segment ends beside the next one's beginning: the gap is for the next
+    iteration to close.
+
+    Args:
+        lost: error of the body, in units of what costs 1, from which on a rollout is no choice.
+        prices: of the state `(2 nv)`, and of targets.
+        drive: units of the wrench, physics steps, threads.
+
+    Returns:
+        `(S,)` the steps taken, and the mean costs of the states' errors.
+    """
+    (price, effort), (unit, substeps, threads) = prices, drive
+    count, joints, nv = len(cut), model.nu, model.nv
+    n = torch.from_numpy(cut[:, 1] - cut[:, 0]).repeat(len(steps))
+    begin = torch.from_numpy(cut[:, 0]).repeat(len(steps))
+    step = torch.tensor(steps, dtype=torch.float64).repeat_interleave(count)[:, None]
+    feed, forward = torch.from_numpy(gains.feedback), torch.from_numpy(gains.forward).double()
+    value, slope = torch.from_numpy(gains.value), torch.from_numpy(gains.slope)
+    cost_of, share = torch.from_numpy(price), torch.from_numpy(path.share)
+    total, worlds = int(n.max()), len(n)
+    qs, vs = (path.qpos.new_empty(total + 1, worlds, x.shape[1]) for x in (path.qpos, path.qvel))
+    us = path.action.new_empty(total, worlds, path.action.shape[1])
+    paid, error = torch.zeros(2, worlds, dtype=torch.float64)
+    gone = torch.zeros(worlds, dtype=torch.bool)
+    backend = CpuBackend(model, worlds, threads)
+    q, v = path.qpos[begin].clone(), path.qvel[begin].clone()
+    for t in range(total + 1):
+        row, on = begin + n.clamp_max(t), t < n
+        qs[t], vs[t] = q, v
+        off = torch.cat((difference(q, path.qpos[row]), v - path.qvel[row]), 1)
+        wrong = torch.cat((difference(q, path.ref_qpos[row]), v - path.ref_qvel[row]), 1)
+        wrong = (wrong.square() * cost_of).sum(1)
+        gone |= ~((wrong / (2 * nv)).sqrt() < lost) & (t <= n)
+        ends = (n == t).nonzero().squeeze(-1)
+        if len(ends):
+            d, r = off[ends].clamp(-10.0, 10.0).nan_to_num(10.0), row[ends]
+            d32 = d.float()
+            paid[ends] += torch.einsum("ni,nij,nj->n", d32, value[r], d32).double()
+            paid[ends] += 2.0 * (slope[r] * d).sum(1)
+        if t == total:
+            break
+        change = torch.einsum("nij,nj->ni", feed[row], off.float().nan_to_num(0.0)).double()
+        act = path.action[row] + step * forward[row] + change
+        near = path.ahead[row]
+        targets = torch.minimum(torch.maximum(act[:, :joints], near - REACH), near + REACH)
+        act = torch.cat((targets, act[:, joints:]), 1).nan_to_num(0.0)
+        us[t] = act
+        apart = act - path.rest[row]
+        wrong = wrong.nan_to_num(AWFUL).clamp_max(AWFUL)
+        price_t = wrong + effort * apart[:, :joints].square().sum(1)
+        price_t += apart[:, joints:].square().sum(1) / share[row] ** 2
+        paid += torch.where(on, price_t, 0.0)
+        error += torch.where(on, wrong, 0.0)
+        q, v = backend.successors(q, v, *driven(act, nv, unit), substeps)
+        bad = ~(q.isfinite().all(1) & v.isfinite().all(1) & (v.abs().amax(1) < WILD))
+        q[bad], v[bad] = path.ref_qpos[row[bad]], path.ref_qvel[row[bad]]
+        gone |= bad & on
+    backend.close()
+    paid = paid.nan_to_num(1e12) + LOST * gone
+    best = paid.view(len(steps), count).argmin(0)
+    pick = best * count + torch.arange(count)
+    for s, w in enumerate(pick.tolist()):
+        a, b = cut[s]
+        # The last row of a motion belongs to its last segment.
+        end = b + int(path.last[b])
+        path.qpos[a:end], path.qvel[a:end] = qs[: end - a, w], vs[: end - a, w]
+        path.action[a:b] = us[: b - a, w]
+    return np.array(steps)[best.numpy()], (error[pick] / n[pick]).numpy()
+
 
 #: Worlds that compute differences, and rows of which a linear model is kept at once (35 kB each).
 WORLDS, ROWS = 4096, 4000
@@ -215,3 +449,55 @@ class TrajectoryOptimizer:
 def _apart(qpos: Tensor, qvel: Tensor, since_q: Tensor, since_v: Tensor) -> Tensor:
     """The tangent state `(N, 2 nv)` from one to another."""
     return torch.cat((difference(qpos, since_q), qvel - since_v), 1)
+
+
+class LqrTeacher:
+    """Acts in one `ImitationEnv` with full knowledge of its state, whatever its observation is.
+
+        u = u_trajectory + K d, where d is how far the character is from its trajectory
+
+    No residual force is used. A teacher for `poise.learn.clone`, and a policy that `poise.score` can
+    score.
+
+    Args:
+        env: the environment that it acts in.
+        trajectories: one per clip of the environment's reference.
+        reach: rad, the most that feedback changes a target.
+        near: mean cost of a state's deviations up to which its linear model says anything; beyond, the
+            action is no lesson (`known`).
+    """
+
+    def __init__(
+        self, env: ImitationEnv, trajectories: Trajectories, reach: float = 0.6, near: float = 0.03
+    ):
+        self.env, self.trajectories, self.reach, self.near = env, trajectories, reach, near
+        self.known: Tensor | None = None
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions `(N, A)` for the worlds as they stand now; `obs` is not looked at."""
+        env, reference = self.env, self.env.reference
+        rows = reference.rows(env.clip, env.frame)
+        off = self._off(rows)
+        self.known = (off.square() * self.trajectories.price).mean(1) < self.near
+        change = torch.einsum("nij,nj->ni", self.trajectories.feedback[rows], off)
+        target = self.trajectories.target[rows] + change.clamp(-self.reach, self.reach)
+        ahead = reference.rows(env.clip, env.frame + 1)
+        action = env.task.pd.action(target, reference.hinges[ahead].float())
+        extra = env.num_actions - action.shape[1]
+        return env.unfiltered(torch.cat((action, action.new_zeros(len(action), extra)), 1))
+
+    def _off(self, rows: Tensor) -> Tensor:
+        """`(N, 2 nv)` from the trajectories to the characters, as the trajectories' clips see it."""
+        env, state = self.env, self.env.backend.state
+        qpos, qvel = self.trajectories.qpos[rows], self.trajectories.qvel[rows]
+        carry = env.reference.carry(env.clip, env.frame)
+        if carry is None:
+            return torch.cat((difference(state.qpos, qpos), state.qvel - qvel), 1).float()
+        turn, move = carry
+        # Back to the first cycle, where the trajectory is.
+        back = quat_conj(turn)
+        place = quat_rotate(back, state.qpos[:, :3] - move)
+        here = torch.cat((place, quat_mul(back, state.qpos[:, 3:7]), state.qpos[:, 7:]), 1)
+        speed = torch.cat((quat_rotate(back, state.qvel[:, :3]), state.qvel[:, 3:]), 1)
+        return torch.cat((difference(here, qpos), speed - qvel), 1).float()

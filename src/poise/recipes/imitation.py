@@ -14,9 +14,9 @@ from poise.body import BodyConfig, BodyTable, Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
-from poise.kin import FitReport, fit_humanoid
-from poise.kin.place import calm_library, on_own_body
-from poise.kin.rate.reading import read_clip
+from poise.kinematics import FitReport, fit_humanoid
+from poise.kinematics.place import calm_library, on_own_body
+from poise.kinematics.rate import read_clip
 from poise.learn import Amp, AmpConfig, LessonConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
@@ -79,7 +79,7 @@ class Imitation:
             `residual_std` where there is a residual force.
         recovery_clips: those of the library, where recovery is learned by them.
         props: what else stands in every world, such as a chair or a ball, or another character, which
-            `papers.compliant.opponent` moves.
+            `papers.compliant.opponents` moves.
         links, touches, floor: of such worlds, see `Scene`; the character's bodies have their own names.
         physics: a model in place of the body's own on a floor, such as a heavier one; without props.
     """

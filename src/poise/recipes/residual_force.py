@@ -8,9 +8,9 @@ Yuan and Kitani, NeurIPS 2020; the motion imitation half.
 | Sec. 5 additive action u = q^ + du      | `control.PDTargets` (additive), the default            |
 | Sec. 4.1 RFC-Explicit, Eqs. 2, 3        | `control.ExplicitResidual`                             |
 | Sec. 4.2 RFC-Implicit, Eqs. 4, 5        | `control.ImplicitResidual`                             |
-| App. B.1 world reward, Eqs. 7 to 11     | `env.terms.reward`, `world_rewards`                    |
-| App. B.2 local reward, Eqs. 12 to 14    | `env.terms.reward`, `local_rewards`                    |
-| App. C early termination                | `env.terms.done.root_too_low`                          |
+| App. B.1 world reward, Eqs. 7 to 11     | `env.rewards`, `world_rewards`                    |
+| App. B.2 local reward, Eqs. 12 to 14    | `env.rewards`, `local_rewards`                    |
+| App. C early termination                | `env.rewards.root_too_low`                          |
 | Table 4 PPO                             | `learn.PPOConfig.paper()`                              |
 """
 
@@ -34,8 +34,9 @@ from poise.control import (
     SuccessHelp,
 )
 from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
+from poise.env import observations as obs
+from poise.env import rewards as reward
 from poise.env.frame import TermFunction
-from poise.env.terms import done, next_frames, obs, reward
 from poise.learn import PPOConfig
 from poise.motion import Clip
 from poise.recipes.imitation import Clips, Imitation, fitted
@@ -61,7 +62,7 @@ class ResidualForce:
             `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
         reward: world (App. B.1) or local (App. B.2).
         observation: reference (state and next reference frame), phase (the paper's), or
-            Skeleton2Humanoid's state with one or two next frames (`env.terms.next_frames`).
+            Skeleton2Humanoid's state with one or two next frames (`env.observations`).
         action: additive or absolute.
         faithful: to the paper or to its authors' code where their values disagree (rotation angle or
             half of it; reward weights).
@@ -246,13 +247,13 @@ def observations(config: ResidualForce, humanoid: Humanoid, frames: int) -> tupl
         return out
     # Where there is no head, the pelvis takes its place.
     head = {"head": humanoid.head or 0}
-    out += (ObsTerm("joints_from_head", next_frames.joints_from_head, head),)
+    out += (ObsTerm("joints_from_head", obs.joints_from_head, head),)
     for k in range(frames):
         at = {"step": k}
         out += (
-            ObsTerm(f"angles_{k + 1}", next_frames.next_angles, at),
-            ObsTerm(f"joints_{k + 1}", next_frames.next_joints, at | head),
-            ObsTerm(f"velocities_{k + 1}", next_frames.next_velocities, at),
+            ObsTerm(f"angles_{k + 1}", obs.next_angles, at),
+            ObsTerm(f"joints_{k + 1}", obs.next_joints, at | head),
+            ObsTerm(f"velocities_{k + 1}", obs.next_velocities, at),
         )
     return out
 
@@ -265,9 +266,9 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
         weight = 0.05 if config.faithful == "code" else 0.1
         rewards += (RewardTerm("residual", reward.residual, weight, imitation=False),)
     dones = {
-        "bodies": DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5}),
-        "height": DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1}),
-        "below": DoneTerm("root_below", done.root_below, {"margin": 0.5}),
+        "bodies": DoneTerm("bodies_too_far", reward.bodies_too_far, {"limit": 0.5}),
+        "height": DoneTerm("root_too_low", reward.root_too_low, {"margin": 0.1}),
+        "below": DoneTerm("root_below", reward.root_below, {"margin": 0.5}),
     }
     frames = {"next frame": (1,), "next two": (1, 2)}.get(config.observation, ())
     return TaskConfig(

@@ -1,27 +1,26 @@
 """Simulation: many worlds of one model, one protocol, one backend per kind of machine."""
 
 from poise.sim.backend import (
+    CONES,
+    INTEGRATORS,
+    SOLVERS,
     STANDARD_FIELDS,
     Backend,
+    SimConfig,
     SimState,
     body_angular_velocity_w,
     body_com_velocity_w,
     body_linear_velocity_w,
 )
-from poise.sim.config import CONES, INTEGRATORS, SOLVERS, SimConfig
 from poise.sim.cpu import CpuBackend
-from poise.sim.diagnose import Cause, diagnose
 from poise.sim.drive import Drive
 from poise.sim.floor import Floor, HeightField, Plane, Steps
-from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
-from poise.sim.index import Place
-from poise.sim.links import Link
+from poise.sim.guard import Cause, Failure, NanGuard, Replay, UnstableError, diagnose, replay_dump
+from poise.sim.links import Link, Place
 from poise.sim.make import check_device, make_backend
-from poise.sim.mechanics import Mechanics
-from poise.sim.rows import CharacterRows
+from poise.sim.mechanics import Mechanics, difference, displaced
 from poise.sim.scene import Character, Scene, SceneModel, Touch, alone
-from poise.sim.scene_sim import Contact, Pull, SceneSim
-from poise.sim.tangent import difference, displaced
+from poise.sim.scene_sim import CharacterRows, Contact, Pull, SceneSim
 from poise.sim.warp import WarpBackend
 from poise.sim.worlds import add_contact_sensors, contact_columns
 

@@ -1,4 +1,4 @@
-"""Jacobians, inertia and the step map of many worlds at once."""
+"""Jacobians, inertia, the step map and differences of positions of many worlds at once."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.motion.rotations import quat_conj, quat_mul, quat_to_rotvec, rotvec_to_quat
 from poise.sim.backend import Backend
 
 
@@ -133,3 +134,18 @@ def _ancestors(model: mujoco.MjModel) -> np.ndarray:
         if start >= 0:
             out[body, start : start + model.body_dofnum[body]] = True
     return out
+
+
+def difference(to: Tensor, since: Tensor) -> Tensor:
+    """`(N, nv)` from the positions `since (N, nq)` to `to`, as MuJoCo's `mj_differentiatePos` in 1 s.
+
+    World metres, then radians in the axes of `since`, then hinges; a free root comes first.
+    """
+    turn = quat_to_rotvec(quat_mul(quat_conj(since[:, 3:7]), to[:, 3:7]))
+    return torch.cat((to[:, :3] - since[:, :3], turn, to[:, 7:] - since[:, 7:]), 1)
+
+
+def displaced(qpos: Tensor, by: Tensor) -> Tensor:
+    """The positions `(N, nq)` that lie `by (N, nv)` from `qpos`: the inverse of `difference`."""
+    turned = quat_mul(qpos[:, 3:7], rotvec_to_quat(by[:, 3:6]))
+    return torch.cat((qpos[:, :3] + by[:, :3], turned, qpos[:, 7:] + by[:, 6:]), 1)

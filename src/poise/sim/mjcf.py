@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from poise.body import Humanoid
-from poise.motion.io.text import write_whole
-from poise.sim.config import SimConfig
+from poise.formats.text import write_whole
+from poise.sim.backend import SimConfig
 from poise.sim.scene import Character, Scene
 
 

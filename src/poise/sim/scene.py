@@ -19,10 +19,9 @@ import mujoco
 from poise.body import Humanoid
 from poise.body.humanoid import add_humanoid
 from poise.errors import PoiseError, did_you_mean
-from poise.sim.config import SimConfig
+from poise.sim.backend import SimConfig
 from poise.sim.floor import Floor, Plane
-from poise.sim.index import Place, place_of
-from poise.sim.links import Link
+from poise.sim.links import Link, Place, place_of
 from poise.sim.props import Prop
 
 #: Things in one scene; more take minutes to compile and are a mistake.

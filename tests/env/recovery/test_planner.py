@@ -11,17 +11,21 @@ import torch
 from torch import Tensor
 
 from poise.env import Reference
-from poise.env.recovery.clips import CALM, QUICK, RecoveryClips, find_recovery_clips
-from poise.env.recovery.entry import STOPS, way_to_stand
-from poise.env.recovery.get_up import LIFT, GetUpPlanner
-from poise.env.recovery.planner import plan_recovery, recovery_motions, walk_of
-from poise.env.recovery.run_up import SPEEDS_UP, run_up
-from poise.kin import Kinematics
+from poise.env.recovery.clips import CALM, LIFT, QUICK, GetUpPlanner, RecoveryClips, find_recovery_clips
+from poise.env.recovery.planner import (
+    SPEEDS_UP,
+    STOPS,
+    plan_recovery,
+    recovery_motions,
+    run_up,
+    walk_of,
+    way_to_stand,
+)
+from poise.kinematics import Kinematics
 from poise.motion import ClipLibrary
-from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual.recovery import standing, walking_clips
-from poise.spatial import quat_angle, quat_between
-from poise.spatial.directions import facing, heading_angle, turned, yaw_quat
+from poise.motion.rotations import facing, heading_angle, quat_angle, quat_between, turned, yaw_quat
+from poise.recipes.perpetual import build, standing, walking_clips
+from poise.recipes.perpetual_settings import Perpetual
 from toy_human import swing
 from toy_library import rises, tiny
 
@@ -214,7 +218,7 @@ def turned_by(a: Tensor, b: Tensor) -> float:
 
 def rolled(quat: Tensor, angle: float) -> Tensor:
     """Turned about the body's own long axis."""
-    from poise.spatial import quat_mul
+    from poise.motion.rotations import quat_mul
 
     half = 0.5 * angle
     return quat_mul(quat, torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)], dtype=torch.float64))

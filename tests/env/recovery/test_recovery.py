@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from poise.env import DoneTerm, ImitationEnv, ObsTerm, Recovery
-from poise.env.recovery.clock import RecoveryClock
-from poise.env.recovery.config import CONTINUED, FALLEN, FAR, TRACKED, toward
+from poise.env import observations as obs
+from poise.env import rewards as reward
+from poise.env.recovery.clock import CONTINUED, FALLEN, FAR, TRACKED, RecoveryClock, toward
 from poise.env.recovery.falls import Drop, lies
-from poise.env.terms import done, phc_obs, phc_reward
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, PPOConfig
 from toy_human import swing
@@ -28,8 +28,8 @@ WALK = swing(2.0, speed=1.0, name="walk")
 def built(make_phc):
     """The PHC task of a walk with Eq. 4's rewards; `recovery` is set by `env_of`."""
     task = make_phc(WALK)
-    rewards = phc_reward.recovery_terms(task.task.rewards)
-    dones = (DoneTerm("too_far", done.bodies_too_far),)
+    rewards = reward.recovery_terms(task.task.rewards)
+    dones = (DoneTerm("too_far", reward.bodies_too_far),)
     return replace(task, task=replace(task.task, rewards=rewards, dones=dones, recovery=QUICK))
 
 
@@ -216,21 +216,21 @@ def test_far_away_the_goal_is_a_point_and_near_all_of_the_motion(built):
     true = whole.pos[2, 0] - sim.pos[2, 0]
     torch.testing.assert_close(to / 5.0, true / true.norm())
     # As the goals tell it: no body differs from its own but the root.
-    rotation = phc_obs.rotation_goal(frame)[1].split([3 * bodies] * 4 + [6 * bodies] * 2)
+    rotation = obs.rotation_goal(frame)[1].split([3 * bodies] * 4 + [6 * bodies] * 2)
     for part in rotation[:3]:
         assert not part.unflatten(0, (bodies, 3))[1:].any()
     assert not rotation[1].any() and not rotation[2].any()
     same = torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(bodies - 1, 6)
     torch.testing.assert_close(rotation[5].unflatten(0, (bodies, 6))[1:], same, atol=1e-6, rtol=0)
-    keys = phc_obs.keypoint_goal(frame)[1].unflatten(0, (3, bodies, 3))
+    keys = obs.keypoint_goal(frame)[1].unflatten(0, (3, bodies, 3))
     assert not keys[0, 1:].any() and not keys[1].any() and float(keys[0, 0].norm()) > 2.9
     env.close()
 
 
-@pytest.mark.parametrize("goal", [phc_obs.rotation_goal, phc_obs.keypoint_goal])
+@pytest.mark.parametrize("goal", [obs.rotation_goal, obs.keypoint_goal])
 def test_what_a_policy_sees_of_a_point_does_not_depend_on_how_the_reference_moves(built, goal):
-    obs = (ObsTerm("self", phc_obs.self_state), ObsTerm("goal", goal))
-    env = env_of(built, 2, auto_reset=False, obs=obs)
+    terms = (ObsTerm("self", obs.self_state), ObsTerm("goal", goal))
+    env = env_of(built, 2, auto_reset=False, obs=terms)
     env.reset_to(*at(2, 3))
     move(env, torch.tensor([[0.0, 2.0, 0.0]] * 2))
     frame = env._frame()
@@ -277,10 +277,10 @@ def test_the_codes_reward_counts_progress_everywhere_and_imitation_by_half(built
     plain = (*built.task.rewards,)
     assert [t.when for t in plain] == ["near"] * 5 + ["far", "far"]
     base = tuple(replace(t, when="always") for t in plain[:5])
-    code = {t.name: t for t in phc_reward.recovery_terms(base, "code")}
+    code = {t.name: t for t in reward.recovery_terms(base, "code")}
     assert code["body_positions"].weight == 0.25 and code["body_positions"].when == "near"
     assert code["energy"].weight == base[4].weight and code["energy"].when == "always"
-    paper = {t.name: t for t in phc_reward.recovery_terms(base)}
+    paper = {t.name: t for t in reward.recovery_terms(base)}
     assert paper["energy_far"].weight == pytest.approx(0.1 * base[4].weight)
     env = env_of(built, 3, rewards=tuple(code.values()))
     frame = env._frame()

@@ -13,9 +13,8 @@ from poise.control import Compliance, Stiffness
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.papers.compliant.standing import standing
-from poise.papers.compliant.stiffness import AXES, Measured, measure
-from poise.papers.compliant.throw_figures import slope, throws
+from poise.papers.compliant.figures import AXES, Measured, measure, slope, throws
+from poise.papers.compliant.motions import standing
 
 
 @pytest.fixture(scope="module")

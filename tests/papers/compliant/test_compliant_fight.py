@@ -14,9 +14,8 @@ from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.papers.compliant.fight import APART_M, opposing, rival_stage, weighed
-from poise.papers.compliant.hopping import BEGINS_S, FLIES_S, STANDS_S, G, hopping, hops
-from poise.papers.compliant.opponent import Opposing
+from poise.papers.compliant.motions import BEGINS_S, FLIES_S, STANDS_S, G, hopping, hops
+from poise.papers.compliant.opponents import APART_M, Opposing, opposing, rival_stage, weighed
 from poise.papers.compliant.scenes import Chicken
 from poise.recipes.imitation import Imitation
 

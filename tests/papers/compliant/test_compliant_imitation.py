@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv
-from poise.env.goals import DisplacedGoal
+from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.learn import Amp, AmpConfig
-from poise.papers.compliant import terms as compliant
+from poise.motion.rotations import into_heading
+from poise.papers.compliant import imitation_controller as compliant
 from poise.papers.compliant.imitation_controller import CompliantImitation, build, config_of
 from poise.recipes.imitation import Imitation
 from poise.settings import to_data
-from poise.spatial import into_heading
 from toy_human import swing
 
 SMALL = {"policy_hidden": (24,), "value_hidden": (24,), "horizon": 4, "minibatch": 16, "epochs": 1}

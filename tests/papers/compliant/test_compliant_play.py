@@ -11,9 +11,9 @@ import torch
 
 from poise.control import Stiffness
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.motion import read_clip
 from poise.papers.compliant.play import WORDS, play
 from poise.papers.compliant.scenes import Balance, Chicken, Doorway, Hands, Pull, Throws, Trampoline
 from poise.papers.compliant.watch import footfalls

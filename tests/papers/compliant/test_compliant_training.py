@@ -16,11 +16,18 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.papers.compliant.on_top import Added, OnTop
 from poise.papers.compliant.play import play
-from poise.papers.compliant.recipe import Compliant
 from poise.papers.compliant.scenes.ball import FictionalForces
-from poise.papers.compliant.training import open_learned, save_learned, scene_task, shipped, train
+from poise.papers.compliant.training import (
+    Added,
+    Compliant,
+    OnTop,
+    open_learned,
+    save_learned,
+    scene_task,
+    shipped,
+    train,
+)
 
 PPO = PPOConfig(
     horizon=4, epochs=1, minibatch=16, std=0.1, policy_hidden=(8,), value_hidden=(8,), norm_warmup=1

@@ -12,13 +12,14 @@ from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, Push, ScenePart
-from poise.env.goals import DisplacedGoal
+from poise.env.events import InScene, ScenePart
+from poise.env.pushes import Push
+from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.motion import read_clip
 from poise.papers.compliant.scenes import (
     SCENES,
     Balance,
@@ -30,8 +31,8 @@ from poise.papers.compliant.scenes import (
     Trampoline,
     ball,
     door,
-    trampoline,
 )
+from poise.papers.compliant.scenes import body_scenes as trampoline
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Scene, SceneSim
 from poise.sim.props import Door

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from poise.control import LinearHelp
-from poise.env.terms import done, next_frames
+from poise.env import observations as obs
+from poise.env import rewards as reward
 from poise.errors import PoiseError
+from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.papers.skeleton2humanoid.recipe import FALLS, INITIAL, LEFT, Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.spatial import quat_conj, quat_mul, quat_rotate
 from toy_human import swing
 
 
@@ -61,14 +62,14 @@ def test_the_state_says_what_is_missing(full: Imitation) -> None:
     for step in (0, 1):
         at = frame + step + 1
         q = ref.qpos[at].float()
-        angles = next_frames.next_angles(f, step)
+        angles = obs.next_angles(f, step)
         torch.testing.assert_close(angles[:, 6:], q[:, 7:] - f.sim.qpos[:, 7:])
-        speeds = next_frames.next_velocities(f, step)
+        speeds = obs.next_velocities(f, step)
         torch.testing.assert_close(speeds[:, 3:], ref.qvel[at].float()[:, 3:] - f.sim.qvel[:, 3:])
-        both = next_frames.next_joints(f, step, h).unflatten(1, (2, -1, 3))
+        both = obs.next_joints(f, step, h).unflatten(1, (2, -1, 3))
         pos, quat = ref.pose.pos[at], ref.pose.quat[at, h]
         seen = quat_rotate(quat_conj(quat)[:, None], pos - pos[:, h : h + 1])
-        own = next_frames.joints_from_head(f, h).unflatten(1, (-1, 3))
+        own = obs.joints_from_head(f, h).unflatten(1, (-1, 3))
         torch.testing.assert_close(both[:, 0] + own, seen, atol=1e-5, rtol=1e-4)
         assert torch.allclose(both[:, 1].norm(dim=-1), (pos - f.sim.pos).norm(dim=-1), atol=1e-5)
     env.close()
@@ -96,21 +97,21 @@ def test_the_state_knows_no_place_and_no_heading(full: Imitation) -> None:
 
     h = full.humanoid.head or 0
     for term, params in (
-        (next_frames.joints_from_head, {"head": h}), (next_frames.next_angles, {"step": 1}),
-        (next_frames.next_velocities, {"step": 1}), (next_frames.next_joints, {"step": 1, "head": h}),
+        (obs.joints_from_head, {"head": h}), (obs.next_angles, {"step": 1}),
+        (obs.next_velocities, {"step": 1}), (obs.next_joints, {"step": 1, "head": h}),
     ):  # fmt: skip
         torch.testing.assert_close(term(here, **params), term(There(), **params), atol=2e-5, rtol=1e-4)
     env.close()
 
 
 def test_an_episode_ends_half_a_metre_too_low(full: Imitation) -> None:
-    assert [t.fn for t in full.task.dones] == [done.root_below]
+    assert [t.fn for t in full.task.dones] == [reward.root_below]
     env = full.env(2, auto_reset=False)
     zero = torch.zeros(2, dtype=torch.long)
     env.reset_to(zero, zero)
     f = env._frame()
-    assert not done.root_below(f).any()
-    assert done.root_below(f, margin=-0.01).all()
+    assert not reward.root_below(f).any()
+    assert reward.root_below(f, margin=-0.01).all()
     env.close()
 
 

@@ -11,10 +11,10 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.control import PDTargets
 from poise.errors import PoiseError
-from poise.kin import Kinematics, lowest_height
+from poise.kinematics import Kinematics, lowest_height
+from poise.motion.rotations import normalize
 from poise.settings import validate
 from poise.sim import Backend
-from poise.spatial import normalize
 
 #: Physics steps over which a random torque is held.
 HELD = 2

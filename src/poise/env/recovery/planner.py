@@ -1,19 +1,4 @@
-"""Recovery motions: from where characters lie, up and over to a place, made of a library's own clips.
-
-Getting up is hard to find by trial, and easy to learn from a clip of it. Of the recovery clips of a
-library (`env.recovery.clips`) a recovery motion is planned for any start:
-
-    lying -> blended (`env.recovery.get_up`) -> a clip that gets up -> the walk, steered -> at ease
-
-It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
-track such motions (`jobs.perpetual.demonstrations`) finds what physics allows.
-
-A body that moves at the start walks on.
-
-Turning follows a unicycle: the heading turns toward the place at no more than `Pace.turn` rad/s, and the
-walk's stride shortens by the cosine of what is left to turn. To a place that is near and behind, the
-walk is played from its end to its start.
-"""
+"""Recovery motions: from where characters lie, up and over to where a motion is entered again."""
 
 from __future__ import annotations
 
@@ -23,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
-from poise.spatial import quat_mul
-from poise.spatial.directions import facing, heading_angle, yaw_quat
+from poise.env.recovery.clips import GetUpPlanner, mixed, smooth
+from poise.env.reference import Reference
+from poise.motion.rotations import facing, heading_angle, quat_mul, yaw_quat
+from poise.sim import displaced
 
 #: m and rad: how near has come back.
 HERE, FACING = 0.08, 0.1
@@ -196,3 +182,121 @@ def on_path(ease: Tensor, cycle: Tensor, path: Tensor, seen: Tensor) -> Tensor:
     stand[:, 3:7] = quat_mul(yaw_quat(psi - heading_angle(ease[3:7])), stand[:, 3:7])
     stand[:, 0], stand[:, 1] = x, y
     return mixed(stand, pose, smooth((pace / WHOLE).clamp(max=1.0)))
+
+
+#: m/s^2 with which it speeds up; s in which the walk passes into the motion; s in which the motion's own
+#: joint velocities fade, back from its first frame.
+SPEEDS_UP, PASSES_S, FADES_S = 2.0, 0.4, 0.1
+
+
+def run_up(get_up: GetUpPlanner, place: Tensor, velocity: Tensor, which: int = 0) -> Tensor:
+    """The frames `(T, 7 + n)` from standing at ease to `place (7 + n)`, at which a body moves with
+    `velocity (6 + n)`; `place` alone where that is no walk or run, forwards or backwards.
+
+    Back from the place, t s before it, the body moves with max(0, v - a t), a = `SPEEDS_UP`, straight
+    on. It walks; in the last `PASSES_S` that passes into the motion as it was before its first frame,
+    x(-t) = x - v t, and for the joints q(-t) = q - v tau (1 - e^(-t / tau)) with tau = `FADES_S`.
+
+    which: of the library's walks.
+    """
+    rate = get_up.rate_hz
+    speed, direction = float(velocity[:2].norm()), math.atan2(float(velocity[1]), float(velocity[0]))
+    cycle, pace, faces = walk_of(get_up, which)
+    ahead = math.cos(direction + faces - heading_angle(place[3:7]))
+    if speed < MOVING or abs(ahead) < AHEAD:
+        return place[None]
+    way = 1 if ahead > 0 else -1
+    toward = direction if way > 0 else direction + math.pi
+    time = torch.arange(math.ceil(speed / SPEEDS_UP * rate) + 1, dtype=torch.float64) / rate
+    moves = (speed - SPEEDS_UP * time).clamp(min=0.0)
+    # Trapezoids, so that it ends at rest.
+    left = torch.cat((time[:1], torch.cumsum((moves[1:] + moves[:-1]) / (2 * rate), 0)))
+    # What is faster than the walk has longer and quicker steps in equal shares.
+    share = moves / pace
+    quick = torch.minimum(share, share.sqrt())
+    begun = nearest_phase(get_up, place, which) * (len(cycle) - 1)
+    to = begun - way * torch.cat((time[:1], torch.cumsum((quick[1:] + quick[:-1]) / 2, 0)))
+    along = torch.tensor([math.cos(direction), math.sin(direction)], dtype=torch.float64)
+    at = place[:2] - left[:, None] * along
+    turns = torch.tensor([[toward, toward + faces]], dtype=torch.float64).expand(len(at), 2)
+    seen = torch.stack((to, quick.clamp(max=1.0 / WHOLE)), 1)
+    walk = on_path(get_up.recovery_clips.ease, cycle, torch.cat((at, turns), 1), seen)
+    fade = FADES_S * (1.0 - torch.exp(-time / FADES_S))
+    before = displaced(place.expand(len(walk), -1), -velocity * fade[:, None])
+    before[:, :2] = at
+    count = round(PASSES_S * rate)
+    return mixed(before, walk, smooth((time * rate / count).clamp(max=1.0))).flip(0)
+
+
+#: s that is stood at ease before a motion is entered.
+CALM_S = 0.3
+#: Where a motion is entered: m for each m/s of its bodies, and for each s of it that is left out or that
+#: is walked to it.
+MOVES, SKIPS = 0.3, 0.05
+#: s of it among which is chosen; later frames cost more than any pose can gain.
+FIRST_S = 30.0
+#: m/s^2 with which what moves comes to stand.
+STOPS = 1.7
+
+
+def entry(get_up: GetUpPlanner, motions: Reference, clip: int, frame: int, qpos: Tensor) -> int:
+    """The frame of a clip, `frame` or a later one, that is most easily come to and gone on from: it
+    nearly stands at ease, hardly moves, and is near in time and on foot.
+
+    Args:
+        motions: the clips.
+        qpos: `(7 + n)`, where the character is.
+    """
+    first, end = int(motions.start[clip]) + frame, int(motions.start[clip] + motions.length[clip])
+    rows = slice(first, min(end, first + round(FIRST_S * motions.rate_hz)))
+    if rows.stop - rows.start < 2:
+        return frame
+    poses = motions.qpos[rows].cpu()
+    apart = get_up.poses(get_up.recovery_clips.ease[None]).apart(get_up.poses(poses))[0]
+    speed = motions.pose.linvel[rows].norm(dim=-1).mean(-1).cpu()
+    later = torch.arange(len(apart)) / motions.rate_hz
+    walked = (poses[:, :2] - qpos[:2]).norm(dim=-1) / walk_of(get_up, 0)[1]
+    return frame + int((apart + MOVES * speed + SKIPS * (later + walked)).argmin())
+
+
+def way_into(
+    get_up: GetUpPlanner,
+    qpos: Tensor,
+    place: Tensor,
+    velocity: Tensor,
+    moves: Tensor | None = None,
+    again: int = 0,
+) -> Tensor:
+    """The frames `(T, 7 + n)` from `qpos (7 + n)` to `place (7 + n)`, at which a motion moves with
+    `velocity (6 + n)`; over standing at ease for `CALM_S` before it.
+
+    moves, again: see `plan_recovery`.
+    """
+    into = run_up(get_up, place, velocity)
+    way = plan_recovery(get_up, qpos, into[0], moves=moves, again=again)
+    way = way[: len(way) - round((STAY_S - CALM_S) * get_up.rate_hz)]
+    return torch.cat((way[:-1], get_up.blend(way[-1], into[0]), into[1:]))
+
+
+def way_to_stand(
+    get_up: GetUpPlanner,
+    qpos: Tensor,
+    place: Tensor | None = None,
+    moves: Tensor | None = None,
+    again: int = 0,
+) -> Tensor:
+    """The frames `(T, 7 + n)` from `qpos (7 + n)` to standing at ease at `place (7 + n)`, by default
+    where it gets up, or where it can stop.
+
+    moves, again: see `plan_recovery`.
+    """
+    up = None
+    if place is None:
+        up = get_up.up(qpos, again) if bool(get_up.lies(qpos)) else None
+        place = (qpos if up is None else up[-1]).clone()
+        if moves is not None and up is None:
+            # x = v |v| / 2a: where what moves can stand.
+            place[:2] += moves * float(moves.norm()) / (2 * STOPS)
+    stand = facing(get_up.recovery_clips.ease, heading_angle(place[3:7]))
+    stand[:2] = place[:2]
+    return plan_recovery(get_up, qpos, stand, moves=moves, again=again, up=up)

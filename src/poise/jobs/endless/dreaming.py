@@ -16,28 +16,24 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
-from poise.env.goals import EndlessGoal
-from poise.env.goals.steering import Steering
+from poise.env.generator import EndlessGoal, Steering
 from poise.errors import PoiseError
-from poise.eval import simulate
-from poise.jobs.endless.config import Dream
-from poise.jobs.endless.dreamt import Character, Dreamt
-from poise.jobs.endless.frames import Body, FrameStore, Pieces
+from poise.jobs.endless.dreamt import Body, Character, Dream, Dreamt, FrameStore, MotionWriter, Pieces
 from poise.jobs.endless.model import GeneratorModel, load_generator
-from poise.jobs.endless.writing import MotionWriter
 from poise.jobs.open import open_run
 from poise.jobs.track.controllers import NO_CRITIC, look_ahead
-from poise.jobs.track.crowd import crowd, places
 from poise.jobs.track.placement import place
+from poise.jobs.track.supports import crowd, places
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
-from poise.kin.rate.reading import read_clip
-from poise.kin.travel import find_travel, travelled
+from poise.kinematics.rate import read_clip
+from poise.kinematics.travel import find_travel, travelled
 from poise.learn.run import interruptible
 from poise.motion import Clip
+from poise.score import simulate
 from poise.settings import changed
 from poise.sim.guard import UnstableError
-from poise.synth.generator import Kinematic
+from poise.synthesis.generator import Kinematic
 
 #: Is told what is done, and how many control steps of how many.
 Show = Callable[[str, int, int], None]

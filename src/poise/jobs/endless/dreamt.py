@@ -1,29 +1,237 @@
-"""What characters that went about did: motion, figures, files."""
+"""How characters go about without end, and what they did: motion, figures, files written meanwhile."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+import os
+import secrets
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
-from poise.eval.card import NO_HELP
-from poise.jobs.endless.config import Dream
-from poise.jobs.endless.figures import Figures
-from poise.jobs.endless.frames import PIECE, Body, FrameStore
+from poise.body import BodyTable, Humanoid
+from poise.env.generator import Steering
+from poise.errors import PoiseError
+from poise.formats import check_writable, home_suffix, write_clip
+from poise.formats.text import write_whole
 from poise.jobs.result import Result, Shown
 from poise.jobs.tracker import Tracker
-from poise.kin import hold_feet, lowest_height
-from poise.kin.fk import Kinematics
+from poise.kinematics import hold_feet, lowest_height, qpos_to_clip
+from poise.kinematics.forward import Kinematics, shapes_of
+from poise.metrics import foot_points, foot_slide, jerk, lowest_points, penetration
 from poise.motion import Clip
-from poise.motion.io import home_suffix, write_clip
-from poise.motion.io.text import write_whole
+from poise.plan import LookaheadConfig
+from poise.score.card import NO_HELP
+from poise.score.report import Report, Shape, Track, write_report
+from poise.settings import validate
 from poise.version import __version__
-from poise.view import Report, Shape, Track, write_report
+
+#: The most characters in a world.
+MOST = 16
+
+
+@dataclass(frozen=True)
+class Dream:
+    """How characters go about.
+
+    Attributes:
+        temperature: deviation of what the kinematic policy draws; below 1 motion is more usual.
+        count: characters in one world, which keep away from each other.
+        targets: x and y, in m, of points that each character is to reach one after another; it begins at
+            the origin.
+        seed: of all draws.
+        controller: the policy looks ahead before it acts, or acts at once.
+        lookahead: how it looks ahead; its seed is `seed`.
+        recover: a character that has fallen gets up and goes on.
+        past: what the kinematic policy goes on from: its own frames, as the paper has it, or what the
+            character did.
+        style: label of the motion of the library that is done, where that has labels; None does all.
+        label_seconds: s for which, on average, a character keeps to motion of one label of the library
+            before it turns to another one; 0 leaves that to chance, as targets and a style do.
+        hold_feet: standing feet are held in place in what is written.
+        threads: cores of lookahead, 0 is all of them.
+    """
+
+    temperature: float = 1.0
+    count: int = 1
+    targets: tuple[tuple[float, float], ...] = ()
+    seed: int = 0
+    controller: Literal["lookahead", "policy"] = "lookahead"
+    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
+    recover: bool = True
+    past: Literal["own", "simulated"] = "own"
+    style: str | None = None
+    label_seconds: float = 10.0
+    hold_feet: bool = True
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if not 1 <= self.count <= MOST:
+            raise PoiseError(f"there may be 1 to {MOST} characters, got {self.count}")
+        if not 0 <= self.temperature <= 10:
+            raise PoiseError(f"the temperature must lie in 0 to 10, got {self.temperature:g}")
+        if not 0 <= self.label_seconds <= 3600:
+            raise PoiseError(f"a label is kept to for 0 to 3600 s, got {self.label_seconds:g}")
+        Steering(self.targets)
+
+
+#: Mean speed (m/s) of the bodies over a second below which a character stands still.
+STILL = 0.1
+
+
+class Figures:
+    """Sums over pieces of coordinates, by the character's own soles and shapes."""
+
+    def __init__(self, humanoid: Humanoid, fps: float):
+        self.humanoid, self.fps = humanoid, fps
+        self._kinematics, self._shapes = Kinematics(humanoid.table), shapes_of(humanoid.table)
+        self._sums, self._frames = np.zeros(4), np.zeros(4)
+        self._still, self._longest = 0.0, 0.0
+        self._quiet = 0
+
+    def add(self, qpos: np.ndarray) -> None:
+        """A piece `(T, 7 + n)` of at least 4 frames; shorter ones are left out."""
+        if len(qpos) < 4:
+            return
+        state = self._kinematics(torch.tensor(qpos))
+        soles = foot_points(state.pos, state.quat, self._shapes, self.humanoid.feet)
+        deep = penetration(lowest_points(state.pos, state.quat, self._shapes)).mean_mm
+        speed = torch.diff(state.pos, dim=0).norm(dim=-1).mean(-1) * self.fps
+        values = (
+            float(foot_slide(soles, self.fps)), float(deep), float(jerk(state.pos, self.fps).mean()),
+            float(speed.mean()),
+        )  # fmt: skip
+        for k, value in enumerate(values):
+            if np.isfinite(value):
+                self._sums[k] += value * len(qpos)
+                self._frames[k] += len(qpos)
+        second = max(1, round(self.fps))
+        for part in speed.split(second):
+            seconds = len(part) / self.fps
+            still = float(part.mean()) < STILL
+            self._quiet += len(part) if still else -self._quiet
+            self._still += seconds * still
+            self._longest = max(self._longest, self._quiet / self.fps)
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Means over all frames; None where nothing was to be measured."""
+        names = ("foot_slide_mm_per_s", "penetration_mm", "jerk_m_per_s3", "speed_m_per_s")
+        means = {
+            name: round(float(s / f), 3) if f else None
+            for name, s, f in zip(names, self._sums, self._frames, strict=True)
+        }
+        return {**means, "still_s": round(self._still, 1), "longest_still_s": round(self._longest, 1)}
+
+
+#: Frames of a piece, and how many of them two pieces share.
+PIECE, SHARED = 300, 30
+
+
+class FrameStore:
+    """Rows of coordinates `(7 + n)`, appended one by one to an unnamed temporary file as float32."""
+
+    def __init__(self, width: int):
+        self.width, self.count = width, 0
+        self._file = tempfile.TemporaryFile(prefix="poise-")  # noqa: SIM115 - it lives as long as this.
+        weakref.finalize(self, self._file.close)
+
+    def append(self, row: np.ndarray) -> None:
+        """One more row `(7 + n)`."""
+        self._file.seek(0, 2)
+        self._file.write(np.asarray(row, np.float32).tobytes())
+        self.count += 1
+
+    def read(self, first: int = 0, last: int | None = None) -> np.ndarray:
+        """Rows `first` to before `last` (by default all), `(T, 7 + n)` float64."""
+        last = self.count if last is None else min(last, self.count)
+        first = min(first, last)
+        self._file.seek(4 * self.width * first)
+        data = self._file.read(4 * self.width * (last - first))
+        return np.frombuffer(data, np.float32).reshape(-1, self.width).astype(np.float64)
+
+
+class Body:
+    """Turns coordinates into clips on a body's skeleton; joints without hinges stay as in `example`."""
+
+    def __init__(self, table: BodyTable, example: Clip, fps: float):
+        self.table, self.example, self.fps = table, example, fps
+
+    def clip(self, qpos: np.ndarray, name: str) -> Clip:
+        """The clip of coordinates `(T, 7 + n)`."""
+        rot = self.example.rot[:1].repeat(len(qpos), 0)
+        like = self.example.replaced(
+            root_pos=qpos[:, :3].copy(), rot=rot, fps=self.fps, name=name, cyclic=False
+        )
+        return qpos_to_clip(qpos, self.table, self.example.skeleton, self.fps, like, name)
+
+
+class Pieces:
+    """Gives motion on in clips of about ten seconds, its standing feet held in place.
+
+    Feet are held in windows of `PIECE + SHARED` frames; where two of them meet, the one passes into the
+    other over `SHARED` frames, so that nothing jumps.
+
+    Args:
+        store: the frames that are there so far.
+        give: gets each clip once, in order.
+        hold: whether standing feet are held at all.
+    """
+
+    def __init__(
+        self, store: FrameStore, body: Body, give: Callable[[Clip], None], name: str, hold: bool = True
+    ):
+        self.store, self.body, self.give, self.name, self.hold = store, body, give, name, hold
+        self._given = 0
+        self._before: Clip | None = None
+
+    def more(self) -> None:
+        """Gives on what is whole; to be called after each frame."""
+        while self.store.count >= self._given + PIECE + SHARED:
+            self._give(self._given + PIECE + SHARED, PIECE)
+
+    def finish(self) -> None:
+        """Gives on what is left."""
+        left = self.store.count - self._given
+        if left > 0:
+            self._give(self.store.count, left)
+
+    def _give(self, last: int, count: int) -> None:
+        clip = self.body.clip(self.store.read(self._given, last), self.name)
+        if self.hold:
+            clip = hold_feet(clip, self.body.table)[0]
+        if self._before is not None:
+            clip = faded(self._before, clip)
+        self._before = _part(clip, count, clip.frames) if clip.frames > count else None
+        self.give(_part(clip, 0, count))
+        self._given += count
+
+
+def faded(before: Clip, after: Clip) -> Clip:
+    """`after`, with its first frames passing over from `before`, which are the same moments."""
+    n = min(before.frames, after.frames)
+    t = (np.arange(n) + 0.5) / n
+    share = (t * t * (3 - 2 * t))[:, None, None]
+    old, new = before.rot[:n], after.rot[:n]
+    sign = np.where((old * new).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    mixed = (1 - share) * sign * old + share * new
+    rot = after.rot.copy()
+    rot[:n] = mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
+    return after.replaced(rot=rot)
+
+
+def _part(clip: Clip, first: int, last: int) -> Clip:
+    return clip.replaced(root_pos=clip.root_pos[first:last], rot=clip.rot[first:last])
+
 
 #: s of the motion that a report shows.
 SHOWN_S = 60.0
@@ -208,3 +416,88 @@ class Dreamt(Result):
             paths[name] = folder / f"{name}{home_suffix(clip)}"
             write_clip(clip, paths[name])
         return paths | self.write(folder)
+
+
+#: Room for the number of frames in a file's header.
+_DIGITS = 9
+#: Bytes of a number in a BVH file, with its space.
+NUMBER = 11
+
+
+class MotionWriter:
+    """Writes pieces of one motion into one file: BVH as they come, so that memory stays flat; any other
+    format at the end. The file appears when it is closed.
+
+    Args:
+        path: the file. example: a clip on the skeleton, for its size. frames: how many are to come,
+            in all files that are written beside each other.
+
+    Raises:
+        PoiseError: the format cannot be written, or there is no room for it on the disk.
+    """
+
+    def __init__(self, path: Path, example: Clip, frames: int):
+        check_writable(path)
+        self.path, self.frames = path, 0
+        self._streams = path.suffix.lower() == ".bvh"
+        need = NUMBER * (3 * len(example.skeleton) + 3) * frames
+        free = shutil.disk_usage(path.parent).free
+        if need > free:
+            raise PoiseError(
+                f"the motion takes about {need / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free", path,
+                "Make a shorter one, or choose another disk",
+            )  # fmt: skip
+        self._beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+        self._pieces = list[Clip]()
+        self._turns: np.ndarray | None = None
+        self._last: np.ndarray | None = None
+        self._at = 0
+
+    def add(self, clip: Clip) -> None:
+        """The next frames."""
+        self.frames += clip.frames
+        if not self._streams:
+            self._pieces.append(clip)
+            return
+        with tempfile.TemporaryDirectory(prefix="poise-") as folder:
+            piece = Path(folder) / "piece.bvh"
+            write_clip(clip, piece)
+            head, _, rest = piece.read_text(encoding="utf-8").partition("MOTION\n")
+        count, step, body = rest.split("\n", 2)
+        assert count.startswith("Frames:")
+        rows = np.array([line.split() for line in body.strip().split("\n")], float)
+        if self._turns is None:
+            words = [w for line in head.split("\n") if "CHANNELS" in line for w in line.split()[2:]]
+            self._turns = np.array([w.endswith("rotation") for w in words])
+            lines = f"{head}MOTION\nFrames: "
+            self._at = len(lines.encode())
+            self._beside.write_text(f"{lines}{0:<{_DIGITS}}\n{step}\n", encoding="utf-8")
+        if self._last is not None:
+            # Angles go on from those of the last piece.
+            jump = np.round((rows[0] - self._last) / 360.0) * 360.0
+            rows -= np.where(self._turns, jump, 0.0)
+        self._last = rows[-1]
+        form = " ".join(["%.6f"] * rows.shape[1]) + "\n"
+        with self._beside.open("a", encoding="utf-8") as file:
+            file.writelines(form % tuple(row) for row in rows)
+
+    def close(self) -> Path | None:
+        """Puts the file into its place; None where no frame came."""
+        if not self.frames:
+            return None
+        if not self._streams:
+            root = np.concatenate([p.root_pos for p in self._pieces])
+            rot = np.concatenate([p.rot for p in self._pieces])
+            write_clip(self._pieces[0].replaced(root_pos=root, rot=rot), self.path)
+            return self.path
+        with self._beside.open("r+", encoding="utf-8") as file:
+            file.seek(self._at)
+            file.write(f"{self.frames:<{_DIGITS}}")
+            file.flush()
+            os.fsync(file.fileno())
+        self._beside.replace(self.path)
+        return self.path
+
+    def discard(self) -> None:
+        """Leaves nothing behind."""
+        self._beside.unlink(missing_ok=True)

@@ -1,25 +1,23 @@
-"""A kinematic policy as one file: weights, sizes, pasts from which it begins, the body's hinges."""
+"""A kinematic policy as one file: weights, sizes, pasts from which it begins, labels."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import Humanoid
 from poise.errors import PoiseError
-from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.state import load_module, prefixed, take
-from poise.nets.cosine_cvae import CosineCVAE, make_cvae
-from poise.nets.cvae import CVAE, CVAEConfig
+from poise.learn.checkpoint import load_checkpoint, load_module, prefixed, save_checkpoint, take
+from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, Frames, make_cvae
 from poise.settings import from_data
-from poise.synth.codes import Codes
-from poise.synth.generator import Kinematic
-from poise.synth.place_free import ROOT
+from poise.synthesis.generator import ROOT, Codes, Kinematic
 
 #: The file in a run's folder.
 GENERATOR = "generator.safetensors"
@@ -47,7 +45,7 @@ class GeneratorModel:
     """A kinematic policy ready to use.
 
     Attributes:
-        net: see `nets.cvae`.
+        net: see `learn.cvae`.
         seeds: `(S, p, 7 + n)` pasts from which motions begin.
         bounds: `(2, n)` rad, least and most of each hinge in the library.
         hinges: names of the body's hinges, in order.
@@ -162,3 +160,102 @@ def load_generator(path: str | Path | None = None) -> GeneratorModel:
         net.eval(), tensors["seeds"].double(), tensors["bounds"].double(), hinges, float(meta["fps"]),
         meta["about"], codes, tuple(meta.get("labels", ())), kinds,
     )  # fmt: skip
+
+
+#: The file in a library's folder, and how many labels it may have.
+LABELS, MOST = "labels.txt", 1000
+
+
+class Label(NamedTuple):
+    """A name, and what names of its clips match."""
+
+    name: str
+    pattern: re.Pattern[str]
+
+
+def read_labels(path: Path) -> tuple[Label, ...]:
+    """The labels of a file; of a folder those of its `labels.txt`, none where there is none.
+
+    Raises:
+        PoiseError: a line says something else.
+    """
+    if path.is_dir():
+        path = path / LABELS
+        if not path.is_file():
+            return ()
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise PoiseError("the labels could not be read", path, "Give a text file") from None
+    out = list[Label]()
+    for number, line in enumerate(lines, 1):
+        words = line.split("#")[0].split(None, 1)
+        if not words:
+            continue
+        try:
+            name, pattern = words[0], re.compile(words[1].strip())
+        except IndexError:
+            raise PoiseError(f"line {number} has a label alone", path, "Write LABEL REGEX") from None
+        except re.error as problem:
+            raise PoiseError(f"line {number} has no regular expression ({problem})", path) from None
+        out.append(Label(name, pattern))
+    if len(out) > MOST:
+        raise PoiseError(f"there may be {MOST} labels at most, got {len(out)}", path)
+    return tuple(out)
+
+
+def names_of(labels: Sequence[Label]) -> tuple[str, ...]:
+    """The labels' names, each once, in order."""
+    return tuple(dict.fromkeys(label.name for label in labels))
+
+
+def kinds_of(clips: Sequence[str], labels: Sequence[Label]) -> Tensor:
+    """Which label each clip has, its number among `names_of`, `(C,)`; -1 for none."""
+    names = names_of(labels)
+    found = [next((k for k in labels if k.pattern.search(c)), None) for c in clips]
+    return torch.tensor([-1 if k is None else names.index(k.name) for k in found])
+
+
+def clips_of_seeds(motions: Motions, past: int) -> Tensor:
+    """Which clip each of `motions.seeds` is of, `(S,)`; as `training.motions_of` picks them."""
+    sizes = torch.diff(motions.frames.first).tolist()
+    clips = [c for c, n in enumerate(sizes) for _ in range(0, n - past, past)]
+    return torch.tensor(clips)[spread(len(clips), len(motions.seeds))]
+
+
+def spread(count: int, most: int) -> Tensor:
+    """At most so many of `count` numbers from 0 on, evenly spread."""
+    return torch.tensor(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
+#: Share of the mean weight that every number has.
+LEAST = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """A library as a kinematic policy learns it.
+
+    Attributes:
+        frames: windows of frames that know no place, see `synthesis.generator`.
+        seeds: `(S, p, 7 + n)` pasts of the library, evenly spread.
+        bounds: `(2, n)` rad, least and most of each hinge.
+        reach: `(10 + n)` m, how far a deviation of each number moves the body, see `reach_of`.
+        hinges: names.
+        fps: frames a second.
+        clips: names.
+    """
+
+    frames: Frames
+    seeds: Tensor
+    bounds: Tensor
+    reach: Tensor
+    hinges: tuple[str, ...]
+    fps: float
+    clips: tuple[str, ...]
+
+    @property
+    def weights(self) -> Tensor:
+        """Of the squares of a frame's numbers: all hinges are not worth the same."""
+        share = self.reach.square() / self.reach.square().mean()
+        return (share + LEAST) / (1 + LEAST)

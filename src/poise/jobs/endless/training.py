@@ -1,11 +1,13 @@
-"""Trains a kinematic policy on a folder of clips, on the body of the policy that is to do its motion."""
+"""Trains a kinematic policy on a folder of clips, in a run folder."""
 
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -13,27 +15,34 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
-from poise.jobs.endless.labels import Label, clips_of_seeds, kinds_of, names_of, spread
-from poise.jobs.endless.model import GENERATOR, GeneratorModel
+from poise.jobs.endless.model import (
+    GENERATOR,
+    GeneratorModel,
+    Label,
+    Motions,
+    clips_of_seeds,
+    kinds_of,
+    names_of,
+    spread,
+)
+from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.run import clips_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.kin.fk import Kinematics
-from poise.learn.cvae import CVAEObjective, CVAETraining, Frames
+from poise.kinematics.forward import Kinematics
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint, take
+from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, CVAEObjective, CVAETraining, Frames, make_cvae
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
 from poise.motion import ClipLibrary
-from poise.nets.cosine_cvae import CosineCVAE, make_cvae
-from poise.nets.cvae import CVAE, CVAEConfig
-from poise.settings import to_data, validate
-from poise.synth.codes import Codes
-from poise.synth.place_free import ROOT, coordinates, features_of
+from poise.settings import from_data, to_data, validate
+from poise.synthesis.generator import ROOT, Codes, coordinates, features_of
 
 #: Pasts that are kept, from which motions begin.
 SEEDS = 256
 #: Windows below which a library is too small.
 LEAST_WINDOWS = 50
-#: Share of the mean weight that every number has, and how long velocities are thought to last, s.
-LEAST, LASTS = 0.3, 0.5
+#: How long velocities are thought to last, s.
+LASTS = 0.5
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,7 @@ class Endless:
     """Settings of a kinematic policy's training.
 
     Attributes:
-        net: sizes and kind of the network, see `nets.cvae`.
+        net: sizes and kind of the network, see `learn.cvae`.
         training: see `learn.cvae`.
         steps: steps of the whole training.
         ema: how much of the averaged weights stays at each step.
@@ -69,35 +78,6 @@ class Endless:
     def paper(cls) -> Endless:
         """What the paper states: 1,000 epochs of 10,000 windows in minibatches of 256."""
         return cls(CVAEConfig(), CVAETraining.paper(), steps=40_000, ema=0.0, codes=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Motions:
-    """A library as a kinematic policy learns it.
-
-    Attributes:
-        frames: windows of frames that know no place, see `synth.place_free`.
-        seeds: `(S, p, 7 + n)` pasts of the library, evenly spread.
-        bounds: `(2, n)` rad, least and most of each hinge.
-        reach: `(10 + n)` m, how far a deviation of each number moves the body, see `reach_of`.
-        hinges: names.
-        fps: frames a second.
-        clips: names.
-    """
-
-    frames: Frames
-    seeds: Tensor
-    bounds: Tensor
-    reach: Tensor
-    hinges: tuple[str, ...]
-    fps: float
-    clips: tuple[str, ...]
-
-    @property
-    def weights(self) -> Tensor:
-        """Of the squares of a frame's numbers: all hinges are not worth the same."""
-        share = self.reach.square() / self.reach.square().mean()
-        return (share + LEAST) / (1 + LEAST)
 
 
 def motions_of(
@@ -246,3 +226,97 @@ def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int, kinds: Tensor
     keys, mean, log_var = (torch.cat(x) for x in zip(*parts, strict=True))
     kinds = kinds[clip] if kinds is not None and bool((kinds >= 0).any()) else None
     return replace(codes, keys=keys, mean=mean, log_var=log_var, kinds=kinds)
+
+
+#: What a run begins with.
+RUN_FILE = "motions.safetensors"
+#: Steps that are timed before a training begins.
+TRIALS = 8
+
+
+class _Meta(TypedDict):
+    kind: str
+    config: dict[str, Any]
+    library: list[str]
+    hinges: list[str]
+    fps: float
+    clips: list[str]
+
+
+def begin(
+    folder: Path,
+    library: Path,
+    tracker: Tracker,
+    config: Endless,
+    minutes: float | None = None,
+    hold_out: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
+    reading: LibraryConfig | None = None,
+    source: Sequence[str] = (),
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Motions, Endless]:
+    """Reads the library once, then what is kept of it, and fixes the number of steps.
+
+    Args:
+        minutes: as many steps as fit into them here, in place of those of the settings.
+        source: what else tells one library from another, in words.
+
+    Returns:
+        the motions, and the settings: those of the run that is in the folder, if there is one.
+
+    Raises:
+        PoiseError: the folder holds a run of another library or with other settings, or the library is
+            too small.
+    """
+    run, said = folder / RUN_FILE, [str(library.resolve()), *hold_out, *leave_out, *source]
+    if run.exists():
+        motions, held, of = opened(run)
+        wanted = to_data(config) | ({"steps": held.steps} if minutes is not None else {})
+        if of != said or to_data(held) != wanted:
+            what = "the folder holds a run of another library or with other settings"
+            raise PoiseError(what, folder, "Resume it as it is or choose another folder")
+        return motions, held
+    motions = read_motions(
+        library, tracker, config.net, hold_out, tell, leave_out=leave_out, config=reading
+    )
+    if minutes is not None:
+        config = from_data(Endless, to_data(config) | {"steps": steps_in(motions, config, minutes)}, run)
+    meta: _Meta = {
+        "kind": "endless run", "config": to_data(config), "library": said,
+        "hinges": list(motions.hinges), "fps": motions.fps, "clips": list(motions.clips),
+    }  # fmt: skip
+    tensors = {
+        "frames": motions.frames.frames, "first": motions.frames.first, "seeds": motions.seeds,
+        "bounds": motions.bounds, "reach": motions.reach,
+    }  # fmt: skip
+    save_checkpoint(run, tensors, dict(meta))
+    return motions, config
+
+
+def opened(run: Path) -> tuple[Motions, Endless, list[str]]:
+    """The motions of a run, its settings, and what its library was.
+
+    Raises:
+        PoiseError: the file is damaged or of another kind.
+    """
+    tensors, meta = load_checkpoint(run, _Meta)
+    if meta["kind"] != "endless run":
+        raise PoiseError("the file is no training of a kinematic policy", run)
+    frames, first, seeds, bounds, reach = (
+        take(tensors, k) for k in ("frames", "first", "seeds", "bounds", "reach")
+    )
+    motions = Motions(
+        Frames(frames, first), seeds, bounds, reach, tuple(meta["hinges"]), float(meta["fps"]),
+        tuple(meta["clips"]),
+    )  # fmt: skip
+    return motions, from_data(Endless, meta["config"], run), meta["library"]
+
+
+def steps_in(motions: Motions, config: Endless, minutes: float) -> int:
+    """How many steps this machine makes in `minutes`, measured on a network that is thrown away."""
+    learner, generator = learner_of(motions, config), torch.Generator().manual_seed(0)
+    learner.step(motions.frames, 0, generator)
+    begun = time.perf_counter()
+    for _ in range(TRIALS):
+        learner.step(motions.frames, 0, generator)
+    return max(20, int(60 * minutes / ((time.perf_counter() - begun) / TRIALS)))

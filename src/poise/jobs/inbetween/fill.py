@@ -12,13 +12,13 @@ from importlib.resources import files
 from pathlib import Path
 
 from poise.errors import PoiseError
+from poise.formats import home_suffix, write_clip
 from poise.jobs.result import Result, Shown, clip_of
-from poise.learn.model import MODEL, InbetweenModel, load_model
+from poise.learn.inbetween import MODEL, InbetweenModel, load_model
 from poise.motion import Clip
-from poise.motion.io import home_suffix, write_clip
-from poise.synth.gaps import check_keyframes
-from poise.synth.inbetween import EACH_GAP, Filling, fill_keyframes
-from poise.synth.verdict import GapFault
+from poise.synthesis.filler import EACH_GAP, Filling, check_keyframes
+from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.rounds import GapFault
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,7 +26,7 @@ class Inbetweened(Result):
     """What came of filling keyframes; nothing is simulated, so there is no score.
 
     clips: the first is the best guess, the others are variants. source: what came in. keyframes: its
-    frames that stayed. warnings: what is doubtful. over: see `synth.inbetween.Filled`. faults: what
+    frames that stayed. warnings: what is doubtful. over: see `synthesis.inbetween.Filled`. faults: what
     the doctor finds in the gaps after all that was tried, clip by clip.
     """
 

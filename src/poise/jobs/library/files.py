@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from poise.errors import PoiseError
-from poise.motion.io.formats import READERS
-from poise.motion.io.numpy.arrays import is_statistics
-from poise.motion.io.refused import refuse_flat_folder
-from poise.motion.io.text import read_head
+from poise.formats.arrays import is_statistics
+from poise.formats.refused import refuse_flat_folder
+from poise.formats.table import READERS
+from poise.formats.text import read_head
 
 #: Files that hold part of a motion beside them: its skeleton, its numbers.
 COMPANIONS = (".asf", ".bin")

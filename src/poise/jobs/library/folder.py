@@ -2,7 +2,7 @@
 
 Perpetual Humanoid Control (Luo et al. 2023, section 4) trains on AMASS without the sequences in which
 a performer sits on furniture, hangs or is carried, by a list made by hand. Here rules tell them
-(`kin.doctor`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules them.
+(`kinematics.repair`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from typing import NamedTuple
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
+from poise.formats.own import pack_clips, unpack_clips
 from poise.jobs.library.clips import (
     LibraryConfig,
+    LibraryReport,
     Target,
     place,
     read_all,
@@ -34,12 +36,10 @@ from poise.jobs.library.files import (
     motion_files_of,
     subject_of,
 )
-from poise.jobs.library.report import LibraryReport
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip, ClipLibrary, Skeleton
-from poise.motion.edits import backwards
-from poise.motion.mirror import mirrored_clip
-from poise.motion.pack import pack_clips, unpack_clips
+from poise.motion.clip import backwards
+from poise.motion.windows import mirrored_clip
 
 #: Grows whenever the same files and settings would give other clips.
 VERSION = 4

@@ -1,18 +1,10 @@
-"""A run of the perpetual controller in a folder: begun, trained to its end, evaluated, opened again.
-
-run/
-    run.safetensors         the clips and the settings, all that the run needs to be rebuilt
-    checkpoint.safetensors  the stage in progress with everything that decides what comes next
-    primitive-K.safetensors each primitive as it was when its stage ended; recovery.safetensors likewise
-    policy.safetensors      the policy of the finished run
-    log.csv, success.csv    the learning curve; every evaluation of every clip
-    result.json             what the finished run came to, without help
-"""
+"""A run of the perpetual controller in a folder: begun, trained, evaluated, opened, kept as a file."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,24 +13,84 @@ from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.jobs.library.clips import LibraryConfig, Target
 from poise.jobs.library.folder import library_of, split
-from poise.jobs.perpetual.result import RESULT, PerpetualResult, finish
+from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips, try_recovery
 from poise.jobs.perpetual.stage_order import Progress, Stage
+from poise.jobs.perpetual.stage_start import staged
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, write_run
 from poise.jobs.warm_start import SMALL_STEP, TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, WarmStart, load_checkpoint
-from poise.learn.checkpoint import PolicyMeta
-from poise.learn.lock import alone
+from poise.learn.checkpoint import PolicyMeta, alone, prefixed, under, write_atomic
 from poise.learn.run import interruptible
-from poise.learn.state import prefixed, under
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual.config import WIDE, config_of
-from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
+from poise.recipes.perpetual import RECIPE, build, task
+from poise.recipes.perpetual_settings import WIDE, Perpetual, config_of
+from poise.score import ClipResults, RecoveryCard
 from poise.settings import to_data
+from poise.version import __version__
 
 if TYPE_CHECKING:
     from poise.jobs.tracker import Tracker
+
+
+RESULT = "result.json"
+
+
+@dataclass(frozen=True, eq=False)
+class PerpetualResult:
+    """How a training ended.
+
+    last: the last iteration, None where nothing was left to do. interrupted: by Ctrl-C; then there is no
+    `results`, which are those of the finished policy on every clip, without help. solved: nothing
+    failed any more before the time was over. primitives: how many were trained, beside that of
+    recovery. recovery: trials of it with the finished policy, None where it never learned any.
+    """
+
+    last: Progress | None
+    interrupted: bool
+    solved: bool
+    primitives: int
+    results: ClipResults | None
+    recovery: RecoveryCard | None = None
+
+
+def finish(stages: StageTrainer) -> tuple[ClipResults, RecoveryCard | None]:
+    """The policy as a file, and what it does with every clip, without help, and in trials of recovery if
+    it learned that, as `result.json`."""
+    policy, t, stage = stages.policy(), stages.trainer, stages.stage
+    imitation, where = staged(stages.imitation, stage), (stages.threads, stages.device)
+    facts = {
+        "method": imitation.config.method, "seed": imitation.config.seed, "stage": stage.name,
+        "recovers": stages.recovers, "primitives": stages.primitives,
+        "solved": stages.finished, "iterations": stages.iteration,
+    }  # fmt: skip
+    cost = {"samples": t.samples, "seconds": round(t.seconds, 1)}
+    results, card = evaluate_clips(imitation, policy, None, 0.0, *where), None
+    if stages.recovers:
+        card = try_recovery(imitation, policy, imitation.config.recovering.final_trials, *where)
+    stages.history.add(stages.iteration, FINAL_STAGE, 0.0, results)
+    policy.save(stages.folder / FINAL, t.character, facts | cost)
+    names, owner = imitation.library.names, stages.stage_record.owner.tolist()
+    rows = [
+        {
+            "clip": names[c], "succeeded": bool(results.succeeded[k]), "frames": int(results.frames[k]),
+            "tracked": int(results.tracked[k]), "mpjpe_mm": round(float(results.mpjpe_mm[k]), 3),
+            "mpjpe_global_mm": round(float(results.global_mm[k]), 3), "primitive": owner[c] + 1,
+        }
+        for k, c in enumerate(results.clip.tolist())
+    ]  # fmt: skip
+    said = facts | cost | {
+        "version": __version__, "help_n": 0.0, "succ": results.rate, "clips": len(rows),
+        "mpjpe_global_mm": round(results.error_mm, 3),
+        "recovery": {
+            "policy": None if card is None else card.to_dict(), "primitive": stages.stage_record.recovery
+        },
+        "hardest": [names[c] for c in results.hardest(20)], "per_clip": rows,
+    }  # fmt: skip
+    write_atomic(stages.folder / RESULT, json.dumps(said, indent=2, allow_nan=False).encode())
+    return results, card
+
 
 #: Where a run file holds what its library knows of coming back.
 WAYS = "ways"

@@ -20,9 +20,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from poise.eval import ClipResults, RecoveryCard
 from poise.learn import Decision, IterationStats
-from poise.recipes.perpetual.config import Perpetual, Recovers
+from poise.recipes.perpetual_settings import Perpetual, Recovers
+from poise.score import ClipResults, RecoveryCard
 
 #: Networks that learn all clips in one stage.
 WHOLE = ("single", "joint")

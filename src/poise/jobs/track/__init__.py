@@ -1,7 +1,7 @@
 """Tracking any motion with a trained policy: one simulated episode, nothing is trained."""
 
-from poise.jobs.track.config import TrackConfig
 from poise.jobs.track.controllers import Keeper, look_ahead
+from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.tracked import Clean, Tracked, write
 from poise.jobs.track.tracking import (
     imitation_of,

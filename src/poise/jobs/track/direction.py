@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError, did_you_mean
-from poise.kin.directed import LIMBS, PELVIS, Pin, TouchPoint, check_asked, directed, ease
+from poise.kinematics.directed import LIMBS, PELVIS, Pin, TouchPoint, check_asked, directed, ease
 from poise.motion import Clip
 
 #: Cost per metre of distance in a control step of a part that counts twice, and of limbs that are

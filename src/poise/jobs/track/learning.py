@@ -1,42 +1,76 @@
-"""A policy goes on to learn the one motion that it loses.
-
-    tracked = track(clip, tracker)
-    if tracked.failures:
-        tracker = learn(tracker, tracked.placed, Path("out/learned"), minutes=10).tracker
-
-What a policy knows of a thousand motions makes the next one cheap: it begins by following most of it.
-"""
+"""A policy goes on to learn the one motion that it loses, or is helped as weakly as suffices."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
+
 from poise.env import Reference
-from poise.eval.rolloutset import judge
-from poise.jobs.perpetual.result import PerpetualResult
-from poise.jobs.perpetual.run import begin, going_on, train
+from poise.jobs.open import policy_of_run
+from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.perpetual.run import PerpetualResult, begin, going_on, train
 from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
-from poise.jobs.track.best import RULE
-from poise.jobs.track.helping import GRAVITY, SHARES, enough, helped, with_guide
-from poise.jobs.track.helping import STARTS as ENOUGH_STARTS
-from poise.jobs.track.missing import needs_of
+from poise.jobs.track.controllers import RULE
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.supports import Wanted, with_supports
-from poise.jobs.track.tracked import Tracked
+from poise.jobs.track.tracked import Tracked, needs_of
 from poise.jobs.track.tracking import imitation_of
-from poise.jobs.tracker import Tracker, policy_of_run
+from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened
-from poise.kin.doctor.clean import clean_clip
-from poise.learn import LATEST, Until
+from poise.kinematics.repair.estimate import clean_clip
+from poise.learn import LATEST, PolicyBundle, Until
 from poise.metrics import success_rule
 from poise.motion import Clip, ClipLibrary
-from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual.config import config_of
+from poise.plan import Guide, make_plan
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual_settings import Perpetual, config_of
+from poise.score import ClipResults
+from poise.score.rollouts import judge
+
+#: m/s^2, gravity, by which body weight is counted.
+GRAVITY = 9.81
+#: Shares of the body's weight that are tried as help, from the least on.
+SHARES = (0.15, 0.3, 0.6, 1.2, 2.4)
+#: Start frames from which the help is to suffice.
+STARTS = 16
+#: Where in the training the help has ended at the latest, and the noise on the residual action beside
+#: the hand that leads, in units of the limit.
+ENDS, NOISE = 0.6, 0.02
+
+
+def with_guide(imitation: Imitation) -> Imitation:
+    """The task of `helped` settings with a hand that leads the root, as far as the help's limit goes."""
+    residual = imitation.task.residual
+    if residual is None:
+        return imitation
+    plan = make_plan(imitation.reference)
+    guide = Guide(imitation.reference, residual, plan.force_h, plan.torque_b)
+    return replace(imitation, task=replace(imitation.task, guide=guide))
+
+
+def helped(config: Perpetual, newtons: float) -> Perpetual:
+    """The settings with help that begins with so many N and N m, and fades."""
+    return replace(config, help_start=newtons, help_share=ENDS, residual_std=NOISE)
+
+
+def enough(
+    imitation: Imitation, policy: PolicyBundle, scales: Sequence[float], starts: int, threads: int = 0
+) -> tuple[float, ClipResults] | None:
+    """The first of some shares of a task's help with which a policy does its motion from so many start
+    frames, and how it does; None where none suffices."""
+    first = torch.zeros(1, dtype=torch.long)
+    for scale in scales:
+        results = evaluate_clips(imitation, policy, first, scale, threads, starts=starts)
+        if bool(results.succeeded.all()):
+            return scale, results
+    return None
+
 
 #: Worlds, samples of a gradient step, and iterations from one evaluation to the next: a motion of
 #: seconds has fewer hard motion bins than a library.
@@ -128,7 +162,7 @@ def help_wanted(tracker: Tracker, placed: Placed, seed: int = 0, threads: int = 
         task = with_guide(with_supports(imitation_of(own, [placed]), "auto", placed)[1])
         dims = 0 if task.task.residual is None else task.task.residual.dims
         policy = tracker.policy.with_actions(tracker.policy.num_actions + dims)
-        if enough(task, policy, (1.0,), ENOUGH_STARTS, threads):
+        if enough(task, policy, (1.0,), STARTS, threads):
             return newtons
     return None
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.track.config import Controller, TrackConfig
+from poise.jobs.track.settings import Controller, TrackConfig
 from poise.jobs.track.tracking import track
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
@@ -34,8 +34,8 @@ from poise.motion.noise import (
     robustness_levels,
     scaled,
 )
+from poise.score.report.svg import line_plot
 from poise.settings import plain
-from poise.view.svg import line_plot
 
 #: What noise may be called; "video" and "triangulated" are everything that goes wrong with one camera,
 #: and with several.

@@ -15,11 +15,11 @@ from poise.body import BodyTable, Humanoid
 from poise.control import Compliance, Stiffness
 from poise.control.compliance import check_level, check_stiffness
 from poise.env import ImitationEnv
-from poise.env.events import OnePush, Push
-from poise.env.goals import DisplacedGoal
+from poise.env.pushes import OnePush, Push
+from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError, did_you_mean
+from poise.motion.rotations import quat_rotate
 from poise.recipes.imitation import Imitation
-from poise.spatial import quat_rotate
 
 #: N; more is no push.
 MOST_N = 10_000.0

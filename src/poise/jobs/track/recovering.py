@@ -1,4 +1,4 @@
-"""What is done about a motion that is lost: the character gets up, comes back and goes on."""
+"""A motion that is lost: the character gets up and comes back, or a search finds how to do it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,64 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv, Reference
-from poise.env.goals.led import TRACKS, LedGoal
+from poise.env import Acts, ImitationEnv, Reference
+from poise.env.led import TRACKS, LedGoal
 from poise.errors import PoiseError
-from poise.eval import simulate
 from poise.jobs.track.placement import Placed
-from poise.jobs.track.searching import Replay
 from poise.jobs.tracker import Tracker
-from poise.kin import FitReport, qpos_to_clip
-from poise.kin.feet.level import Levelled
+from poise.kinematics import FitReport, qpos_to_clip
+from poise.kinematics.feet import Levelled
 from poise.motion import Clip, ClipLibrary, resample
-from poise.plan import Lookahead
+from poise.motion.rotations import slerp
+from poise.plan import Lookahead, SamplingConfig, SamplingControl, SamplingResult
 from poise.recipes.imitation import Imitation
-from poise.spatial import slerp
+from poise.score import simulate
+
+
+@dataclass(eq=False)
+class Replay:
+    """Actions `(T, A)` one after another, for the one character that they were made for; after them
+    acts the policy, if there is one. by: the controller that made them."""
+
+    actions: Tensor
+    policy: Acts | None = None
+    step: int = 0
+    by: str = "policy"
+
+    def act(self, obs: Tensor) -> Tensor:
+        """The next one, `(1, A)`; `obs` is looked at by the policy alone."""
+        at, self.step = self.step, self.step + 1
+        if at >= len(self.actions) and self.policy is not None:
+            return self.policy.act(obs)
+        return self.actions[at : at + 1]
+
+
+def look_for(
+    tracker: Tracker,
+    imitation: Imitation,
+    config: SamplingConfig,
+    clip: int = 0,
+    threads: int = 0,
+    show: Callable[[int, int], None] | None = None,
+) -> SamplingResult:
+    """Looks for one of a task's motions with the tracker's policy, without help.
+
+    threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
+    """
+    # Worlds that lose the motion may go bad; they are left behind.
+    env = imitation.bare(rewards=True).env(
+        config.characters, auto_reset=False, threads=threads, help_scale=0.0, guard=False
+    )
+    try:
+        return SamplingControl(env, tracker.policy, config, tracker.value, clip).run(show)
+    finally:
+        env.close()
+
+
+def replay(found: SamplingResult, policy: Acts) -> Replay:
+    """Does what was found, and from where it was lost what the policy does."""
+    return Replay(found.actions[: found.reached].clone(), policy)
+
 
 #: A clip that is lost more often within so many s of it is given up, and so is one that the character
 #: has left for so many s; so many of them in a row that it does not even come to end the motion, as

@@ -1,33 +1,32 @@
-"""A part of a motion simulated anew: from the state that was stored, and back into what was simulated.
-
-The character begins in the stored state of the part's first frame and follows the motion; toward the
-part's end its goal becomes what was simulated before, which it then follows for a while. Where the two
-are nearest, the one fades into the other.
-"""
+"""A part of a motion simulated anew: from the stored state, and back into the written motion."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Reference
-from poise.env.recovery.get_up import mixed
+from poise.env.recovery.clips import mixed
 from poise.errors import PoiseError
-from poise.eval import simulate
-from poise.eval.rolloutset import judge
-from poise.jobs.track.best import RULE
-from poise.jobs.track.config import TrackConfig
-from poise.jobs.track.controllers import Done, Show, Told, episode, look_ahead
+from poise.formats import read_clip
+from poise.jobs.track.controllers import RULE, Done, Show, Told, episode, look_ahead
+from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.simulation import Retake, Simulation, States
 from poise.jobs.tracker import Tracker
 from poise.metrics import has_lost, mpjpe_global, success_rule
+from poise.motion import Clip
+from poise.motion.rotations import slerp
 from poise.plan import Lookahead
 from poise.plan.lookahead import PAST
 from poise.recipes.imitation import Imitation
+from poise.score import simulate
+from poise.score.rollouts import judge
 
 #: s over which the goal becomes the earlier simulation, for which that is followed at most, and over
 #: which the two fade into each other.
@@ -281,3 +280,47 @@ def _sentence(taken: Taken, before: Simulation, first: int, last: int, rate: flo
         f"{said}; from {begin:.2f} s to {begin + fade:.2f} s it fades into the earlier one, of which it "
         f"is {taken.apart_mm:.0f} mm off there."
     )
+
+
+#: s over which the part takes over and gives back, within it.
+TAKES_S = 0.2
+
+
+def changed_s(before: Simulation, now: Simulation) -> tuple[float, float]:
+    """The last moment before two simulations of a motion differ, and the first after it, s."""
+    other = (before.qpos != now.qpos).any(1).nonzero()[:, 0]
+    if not len(other):
+        return 0.0, 0.0
+    return (float(other[0]) - 1.0) / now.rate_hz, (float(other[-1]) + 1.0) / now.rate_hz
+
+
+def spliced(before: Clip, now: Clip, span: tuple[float, float]) -> Clip:
+    """The frames of `before`, and of `now` within a span, s, into which and out of which they pass."""
+    if before.frames != now.frames:
+        return now
+    first, last = span
+    t = torch.arange(now.frames, dtype=torch.float64) / now.fps
+    takes = max(min(TAKES_S, (last - first) / 3), 1e-9)
+    # What is simulated to its end has nothing to give back to.
+    ends = torch.full_like(t, torch.inf) if last >= float(t[-1]) else last - t
+    share = eased(torch.minimum(t - first, ends) / takes)
+    old, new = before.tensors(), now.tensors()
+    root = torch.lerp(old[0], new[0], share[:, None])
+    rot = slerp(old[1], new[1], share[:, None].expand(-1, len(now.skeleton)))
+    kept = share == 0.0
+    root[kept], rot[kept] = old[0][kept], old[1][kept]
+    return now.replaced(root_pos=root.numpy(), rot=rot.numpy())
+
+
+def written_as(folder: Path, like: Clip) -> Clip | None:
+    """The motion in a result's folder, as it was written; None where there is none with the skeleton
+    and the frames of `like`."""
+    files = sorted(folder.glob("simulated.*")) if folder.is_dir() else []
+    if len(files) != 1:
+        return None
+    try:
+        clip = read_clip(files[0])
+    except PoiseError:
+        return None
+    same = clip.skeleton.same_bones(like.skeleton) and clip.frames == like.frames
+    return like.replaced(root_pos=np.array(clip.root_pos), rot=np.array(clip.rot)) if same else None

@@ -1,23 +1,28 @@
-"""What a motion rests on besides the floor stands in the world of the character that does it."""
+"""What stands in the world of a character that tracks: supports, and the others of a crowd."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import mujoco
+import numpy as np
 
+from poise.body import Humanoid
 from poise.errors import PoiseError
+from poise.formats.figure import SceneBox
+from poise.formats.gltf_write import write_gltf
+from poise.formats.text import write_whole
 from poise.jobs.track.placement import Placed
-from poise.kin.supports import Support, find_supports
+from poise.kinematics.find_supports import find_supports
+from poise.kinematics.supports import Support
 from poise.motion import Clip
-from poise.motion.io.gltf.boxes import SceneBox
-from poise.motion.io.gltf.write import write_gltf
-from poise.motion.io.text import write_whole
 from poise.recipes.imitation import Imitation
+from poise.sim import Character, CharacterRows, Scene, SceneSim, SimConfig
 from poise.sim.props import Box
 
 #: Which supports there are, see `TrackConfig.supports`.
@@ -117,3 +122,21 @@ def _check_start(imitation: Imitation) -> None:
                 )
     finally:
         env.close()
+
+
+#: Metres between characters that begin side by side.
+APART_M = 2.0
+
+
+def places(count: int) -> np.ndarray:
+    """`(N, 2)` m, where each of N characters begins: rows and columns about the first one's place."""
+    wide = math.ceil(math.sqrt(count))
+    at = np.arange(count)
+    return APART_M * np.stack((at // wide, at % wide), 1).astype(float)
+
+
+def crowd(humanoid: Humanoid, sim: SimConfig, count: int) -> CharacterRows:
+    """N copies of a body on one floor, each a row; names of all but the first begin with "2/", ..."""
+    names = ("", *(str(k + 1) for k in range(1, count)))
+    things = tuple(Character(humanoid, name) for name in names)
+    return SceneSim(Scene(things, sim=sim), 1, threads=1).characters()

@@ -18,30 +18,33 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Reference
 from poise.errors import PoiseError
+from poise.formats import read_clip
+from poise.formats.raw import ReadOptions
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
-from poise.jobs.track.beside_raw import beside_raw
-from poise.jobs.track.best import RULE
-from poise.jobs.track.config import TrackConfig
-from poise.jobs.track.controllers import Show, done_by, led_by
-from poise.jobs.track.crowd import places
-from poise.jobs.track.in_place import InPlace, with_travel
-from poise.jobs.track.missing import needs_of
-from poise.jobs.track.parts import Span, cut, parts_of, with_parts
-from poise.jobs.track.placement import Placed, place, place_all
-from poise.jobs.track.points import fitted, follow, points_of
+from poise.jobs.track.controllers import RULE, Show, done_by, led_by
+from poise.jobs.track.placement import Placed, fitted, follow, place, place_all, points_of
 from poise.jobs.track.pushed import with_push
-from poise.jobs.track.rates import rate_doubts, rate_notes
+from poise.jobs.track.rates import InPlace, rate_doubts, rate_notes, with_travel
 from poise.jobs.track.retaking import retaken
-from poise.jobs.track.supports import with_supports
-from poise.jobs.track.tracked import Clean, Tracked
+from poise.jobs.track.settings import TrackConfig
+from poise.jobs.track.supports import places, with_supports
+from poise.jobs.track.tracked import (
+    Clean,
+    Span,
+    Tracked,
+    beside_raw,
+    cut,
+    needs_of,
+    parts_of,
+    with_parts,
+)
 from poise.jobs.tracker import Tracker
-from poise.kin.fit import widen
-from poise.kin.rate.reading import settled
-from poise.kin.supports import Support
+from poise.kinematics.fit import widen
+from poise.kinematics.rate import settled
+from poise.kinematics.supports import Support
 from poise.metrics import detail, deviations, has_lost, mpjpe_global
-from poise.motion import Clip, ClipLibrary, read_clip
-from poise.motion.io.raw import ReadOptions
+from poise.motion import Clip, ClipLibrary
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import perturb_clip, perturb_points
 from poise.recipes.imitation import Imitation
@@ -68,7 +71,7 @@ def track(
     """Lets a trained policy do a motion that it need not know, without help and without training.
 
     The motion is tracked from its first frame to its last. Keypoints reach a policy with goals of
-    keypoints frame by frame (`kin.retarget`); any other policy gets the clip that is fitted to them.
+    keypoints frame by frame (`kinematics.retarget`); any other gets the clip that is fitted to them.
 
     Args:
         clip: a clip, keypoints, or a file; keypoints in a file stay keypoints. Several of them are done

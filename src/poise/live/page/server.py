@@ -20,8 +20,8 @@ from websockets.http11 import Request, Response
 
 from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION, command, parse
-from poise.live.page.guard import WAITING, Bucket, Doorway, Guard, pauses
-from poise.live.sources.stream import Fits, JsonStream
+from poise.live.sockets import WAITING, Bucket, Doorway, Guard, pauses
+from poise.live.sources import Fits, JsonStream
 from poise.live.stream import Inbox
 
 #: Version, step, simulated time, characters, bodies; then what each does, and numbers.

@@ -1,17 +1,4 @@
-"""Deep Compliant Control (Lee, Chang and Lee, SIGGRAPH 2022): the imitation controller, from nothing.
-
-| paper                                      | here                                                |
-|--------------------------------------------|-----------------------------------------------------|
-| Sec. 4.1 Eq. 11 r_imit = r_q r_p           | `AmpConfig.product`, `terms.root_place`             |
-| Eqs. 12, 13 the discriminator's r_q        | `AmpConfig.compliant`, `terms.posture`              |
-| Eq. 14 r_p                                 | `terms.root_place`                                  |
-| Sec. 4.2 s = s(q (-) u), two poses, u      | `shifted`, `terms`                                  |
-| Sec. 5.1 network, PPO, noise of 6 degrees  | `CompliantImitation.paper`                          |
-| Sec. 3, 5.2 compliance                     | `TaskConfig.compliance`                             |
-
-Policy and discriminator both see q (-) u. Scenes that a policy learns on top of one that tracks stand in
-`recipe`.
-"""
+"""Deep Compliant Control's imitation controller: state, features, rewards (Secs. 4.1, 4.2)."""
 
 from __future__ import annotations
 
@@ -22,19 +9,80 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from poise.body import BodyConfig, Humanoid
 from poise.control import Compliance, PDTargets
 from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
-from poise.env.events import Pushes
-from poise.env.terms import done, obs
+from poise.env import observations as obs
+from poise.env import rewards as reward
+from poise.env.frame import Frame
+from poise.env.pushes import Pushes
+from poise.env.rewards import pose
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, PPOConfig
-from poise.papers.compliant import terms
-from poise.papers.compliant.shifted import Shifted
+from poise.motion.rotations import into_heading, quat_between, quat_to_sixd
+from poise.papers.compliant.opponents import Shifted
 from poise.recipes.imitation import Clips, Imitation, fitted
 from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
+
+
+def two_poses(frame: Frame) -> Tensor:
+    """All bodies now and one control step earlier, m, from the root's place on the floor in the present
+    heading frame `(N, 6 B)`, without what displaces the character."""
+    own = frame.shifted
+    origin = own.pos[:, :1] * own.pos.new_tensor((1.0, 1.0, 0.0))
+    return into_heading(own.heading, torch.cat((own.pos, own.before), 1) - origin).flatten(1)
+
+
+def turns(frame: Frame) -> Tensor:
+    """The orientation of every body in the heading frame, two columns of its matrix each `(N, 6 B)`."""
+    own = frame.shifted
+    local = quat_between(own.heading.unsqueeze(1).expand_as(own.quat), own.quat)
+    return quat_to_sixd(local).flatten(1)
+
+
+def displacement(frame: Frame, source: str = "compliance/u") -> Tensor:
+    """u `(N, 6 + n)`, by how much the goal is displaced, m and rad. source: "shifted/u" is known where
+    nothing gives way, too."""
+    return frame.source(source).float()
+
+
+def posture(frame: Frame) -> Tensor:
+    """What the discriminator, which is shown pairs, sees of a frame: all bodies from the root's place on
+    the floor in the heading frame, m, the turns of the hinged bodies 6D, and the root's velocity, m/s,
+    and speed of turning, rad/s, in that frame `(N, 3 B + 6 J + 6)`.
+
+    Poses are without what displaces the character. The root's velocity stands for the earlier pose of
+    Sec. 4.2, which a frame of a clip does not tell; it is the character's own.
+    """
+    own, sim = frame.shifted or frame.sim, frame.sim
+    origin = own.pos[:, :1] * own.pos.new_tensor((1.0, 1.0, 0.0))
+    places = into_heading(own.heading, own.pos - origin).flatten(1)
+    moves = torch.stack((sim.linvel[:, 0], sim.angvel[:, 0]), 1)
+    moves = into_heading(sim.heading, moves).flatten(1)
+    return torch.cat((places, quat_to_sixd(own.local).flatten(1), moves), 1)
+
+
+def root_place(
+    frame: Frame,
+    weights: tuple[float, float] = (0.7, 0.3),
+    alphas: tuple[float, float] = (0.5, 1.0),
+) -> Tensor:
+    """r_p of Eq. 14: w_p exp(-s_p |p - u_p|^2) + w_v exp(-s_v |v - u_p'|^2), of the root against the
+    displaced reference's, m and m/s in the world."""
+    apart = (frame.sim.pos[:, 0] - frame.ref.pos[:, 0]).square().sum(-1)
+    faster = (frame.sim.qvel[:, :3] - frame.ref.qvel[:, :3]).square().sum(-1)
+    (w_p, w_v), (s_p, s_v) = weights, alphas
+    return w_p * torch.exp(-s_p * apart) + w_v * torch.exp(-s_v * faster)
+
+
+def posed_place(frame: Frame, alpha: float = 2.0) -> Tensor:
+    """r_q r_p with a measured r_q in place of the discriminator's: `reward.pose`, which follows the
+    displaced reference joint by joint."""
+    return pose(frame, alpha) * root_place(frame)
+
 
 #: Three layers of 256 and the discount of Sec. 5.1; the rest is for minutes on a CPU.
 _PPO = PPOConfig(
@@ -98,8 +146,8 @@ class CompliantImitation:
 
 def observations(config: CompliantImitation) -> tuple[ObsTerm, ...]:
     """(s_dyn, u), and where the displaced reference's root is."""
-    u = ObsTerm("displacement", terms.displacement, {"source": "shifted/u"})
-    own = (terms.two_poses, terms.turns)
+    u = ObsTerm("displacement", displacement, {"source": "shifted/u"})
+    own = (two_poses, turns)
     goal = (obs.target_root, *((obs.target_joints,) if config.action == "additive" else ()))
     before, after = (tuple(ObsTerm(t.__name__, t) for t in terms) for terms in (own, goal))
     return (*before, u, *after)
@@ -114,18 +162,18 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
             raise PoiseError("the body has no hands to push", hint="Set newtons=None")
         hz = config.sim.control_hz
         plugins += (Pushes(config.newtons, (0.5, 1.5), 0.3, hands, hz, config.seed),)
-    paid = terms.root_place if config.style else terms.posed_place
+    paid = root_place if config.style else posed_place
     root = torch.tensor([0])
     return TaskConfig(
         obs=observations(config),
         rewards=(RewardTerm(paid.__name__, paid, 1.0),),
         dones=(
-            DoneTerm("root_below", done.root_below, {"margin": 0.35}),
-            DoneTerm("root_far", done.bodies_too_far, {"limit": 1.0, "bodies": root}),
+            DoneTerm("root_below", reward.root_below, {"margin": 0.35}),
+            DoneTerm("root_far", reward.bodies_too_far, {"limit": 1.0, "bodies": root}),
         ),
         pd=PDTargets(config.action),
         horizon=config.horizon,
-        style=(ObsTerm("posture", terms.posture),) if config.style else (),
+        style=(ObsTerm("posture", posture),) if config.style else (),
         compliance=None if config.level is None else Compliance(config.level),
         plugins=plugins,
     )

@@ -20,31 +20,26 @@ import torch
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
-from poise.eval import run_episodes, write_score
-from poise.eval.rolloutset import RolloutSet
+from poise.formats import write_clip
+from poise.formats.text import write_whole
 from poise.jobs.deliver import make_report, simulated_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track import imitation_of
-from poise.jobs.track.best import RULE
-from poise.jobs.track.controllers import look_ahead
+from poise.jobs.track.controllers import RULE, look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
-from poise.motion.io import write_clip
-from poise.motion.io.text import write_whole
-from poise.papers.compliant.fight import opposing, rival_stage, weighed
-from poise.papers.compliant.motions import motion_of
-from poise.papers.compliant.on_top import Topped
-from poise.papers.compliant.recipe import seen
-from poise.papers.compliant.scene_meters import meter_of, words_of
+from poise.papers.compliant.motions import motion_of, standing
+from poise.papers.compliant.opponents import opposing, rival_stage, weighed
 from poise.papers.compliant.scenes import Chicken, PlayScene
-from poise.papers.compliant.standing import standing
-from poise.papers.compliant.training import Learned
-from poise.papers.compliant.watch import Watch
+from poise.papers.compliant.training import Learned, Topped, seen
+from poise.papers.compliant.watch import Watch, meter_of, words_of
 from poise.plan import LookaheadConfig
 from poise.recipes.imitation import Imitation
-from poise.view import Mover, write_report
+from poise.score import run_episodes, write_score
+from poise.score.report import Mover, write_report
+from poise.score.rollouts import RolloutSet
 
 #: What the figures are, in words.
 WORDS = {

@@ -1,8 +1,12 @@
-"""What is looked at while a scene is played: forces, arrows, what moves, how far goals gave way."""
+"""What is looked at while a scene is played: forces, what moves, how far goals gave way."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false
 from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -11,16 +15,48 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.events import ScenePart
-from poise.env.goals import DisplacedGoal
 from poise.env.plugins import Felt, Plugin
-from poise.eval.rolloutset import RolloutSet, judge
-from poise.jobs.track.best import RULE
-from poise.kin import lowest_height
+from poise.env.yielding import DisplacedGoal
+from poise.jobs.track.controllers import RULE
+from poise.kinematics import lowest_height
 from poise.metrics import success_rule
-from poise.papers.compliant.meters import Meter
+from poise.papers.compliant.figures import FALLEN, TOUCHES_N
+from poise.papers.compliant.opponents import Opposing
+from poise.papers.compliant.scenes import Balance, Chicken, Doorway, PlayScene, Trampoline
+from poise.papers.compliant.scenes.ball import COS_45, upright_of
+from poise.papers.compliant.scenes.body_scenes import Bouncing
+from poise.papers.compliant.scenes.door import WANTED, across
 from poise.recipes.imitation import Imitation
-from poise.sim import CharacterRows
-from poise.view import Mover, Shape
+from poise.score.report import Mover, Shape
+from poise.score.rollouts import RolloutSet, judge
+from poise.sim import CharacterRows, Mechanics
+
+
+class Meter(Protocol):
+    """Looks at the environments of a scene, and has figures at the end: means over the episodes."""
+
+    words: Mapping[str, str]
+    """What the figures are, by their keys."""
+
+    def begin(self, env: ImitationEnv) -> None:
+        """Looks at an environment from now on."""
+        ...
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        """Control step `step` has been made; 0 is before the first one."""
+        ...
+
+    def figures(self) -> dict[str, float]:
+        """What was seen."""
+        ...
+
+
+def part_of(env: ImitationEnv) -> ScenePart:
+    """An environment's part in its scene."""
+    part = env.plugin(ScenePart)
+    assert part is not None
+    return part
+
 
 #: N; weaker forces do not count as interaction.
 LEAST_N = 1.0
@@ -149,3 +185,196 @@ def _arrows(felt: list[Felt]) -> np.ndarray:
     rows = [torch.cat((f.point[0], f.force[0]), 1).double().cpu().numpy() for f in felt]
     every = np.concatenate(rows) if rows else np.zeros((0, 6))
     return every[np.linalg.norm(every[:, 3:], axis=1) >= LEAST_N]
+
+
+G = 9.81
+#: s after the first touch at which it is looked how far a player was pushed.
+PUSHED_S = 0.5
+
+
+class DoorMeter:
+    """The force of the knob's weld along and across the knob's way, and how far the door opens."""
+
+    words: Mapping[str, str] = {
+        "across_n": "Force across the knob's way, mean while the hand is welded to it, N",
+        "along_n": "Force along the knob's way, mean, N",
+        "angle_rad": "Door opened, most while the hand held it, rad",
+        "opened": f"Episodes in which it was opened to {WANTED:g} rad",
+    }
+
+    def begin(self, env: ImitationEnv) -> None:
+        self._part = part_of(env)
+        self._sim = self._part.sim
+        self._sums = torch.zeros(3, env.num_envs, dtype=torch.float64)
+        self._angle = torch.zeros(env.num_envs, dtype=torch.float64)
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        state = self._sim.backend.state
+        on = state["eq_active"][:, 0].double()
+        force = self._sim.link("grip").force.double()
+        wide = across(self._part, force)
+        self._sums += on * torch.stack((on, wide.norm(dim=-1), (force - wide).norm(dim=-1)))
+        angle = -state.qpos[:, self._sim.scene.place("door").qpos.start].double()
+        self._angle = torch.maximum(self._angle, on * angle)
+
+    def figures(self) -> dict[str, float]:
+        count, wide, along = self._sums
+        return {
+            "across_n": float((wide / count.clamp_min(1.0)).mean()),
+            "along_n": float((along / count.clamp_min(1.0)).mean()),
+            "angle_rad": float(self._angle.mean()),
+            "opened": float((self._angle >= WANTED).sum()),
+        }
+
+
+class TrampolineMeter:
+    """What the paper looks at on a trampoline: how low the feet come, and the character's energy."""
+
+    words: Mapping[str, str] = {
+        "foot_low_m": "Lowest foot of a landing against where it stood at first, mean, m",
+        "plate_m": "Plate, greatest less lowest height after the first bounce, m",
+        "energy_j": "Energy of the character in the second after a landing, mean, J",
+    }
+
+    def begin(self, env: ImitationEnv) -> None:
+        part = part_of(env)
+        self._bounce = next(h for h in part.happenings if isinstance(h, Bouncing))
+        self._sim, self._mechanics = part.sim, Mechanics(env.backend)
+        self._feet = list(env.goal.humanoid.feet)
+        n = env.num_envs
+        self._low, self._lows, self._landings, self._joules, self._steps = (
+            torch.zeros(n, dtype=torch.float64) for _ in range(5)
+        )
+        self._plate = torch.full((2, n), -torch.inf, dtype=torch.float64)
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        pose, state = env.pose(), env.backend.state
+        foot, com = pose.pos[:, self._feet, 2].amin(1).double(), pose.com[:, 2].double()
+        if step == 0:
+            self._stood, self._com = foot.clone(), com.clone()
+        # A landing is over with the second in which it gives way.
+        lands = self._bounce.gives > 0
+        self._low = torch.where(lands, torch.minimum(self._low, foot - self._stood), self._low)
+        ends = self._bounce.gives == 1
+        self._lows += torch.where(ends, self._low, 0.0)
+        self._low[ends] = 0.0
+        self._landings += ends
+        qvel = state.qvel.double()
+        kinetic = 0.5 * torch.einsum("ni,nij,nj->n", qvel, self._mechanics.inertia().double(), qvel)
+        # E = q'^T M q' / 2 + m g (z - z_0)
+        energy = kinetic + env.goal.humanoid.mass * G * (com - self._com)
+        self._joules += torch.where(lands, energy, 0.0)
+        self._steps += lands
+        if step / env.goal.rate_hz > self._bounce.first_s:
+            height = self._sim.backend.state.qpos[:, self._sim.scene.place("trampoline").qpos.start]
+            self._plate = torch.maximum(self._plate, torch.stack((height, -height)).double())
+
+    def figures(self) -> dict[str, float]:
+        return {
+            "foot_low_m": float((self._lows / self._landings.clamp_min(1.0)).mean()),
+            "plate_m": float(self._plate.sum(0).clamp_min(0.0).mean()),
+            "energy_j": float((self._joules / self._steps.clamp_min(1.0)).mean()),
+        }
+
+
+class BallMeter:
+    """How long the ball stays above the head."""
+
+    words: Mapping[str, str] = {
+        "stays_s": "Ball stays above the head, its rod less than 45 degrees from upright, mean, s",
+        "stays_least_s": "The same, the shortest episode, s",
+        "tilt_deg": "Tilt of the rod while the ball stays, mean, degrees",
+    }
+
+    def begin(self, env: ImitationEnv) -> None:
+        self._part = part_of(env)
+        n = env.num_envs
+        self._up = torch.ones(n, dtype=torch.bool)
+        self._sums = torch.zeros(2, n, dtype=torch.float64)
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        upright = upright_of(self._part.sim)
+        self._up &= upright > COS_45
+        tilt = upright.clamp(-1.0, 1.0).acos()
+        self._sums += self._up * torch.stack((torch.ones_like(tilt), tilt))
+        self._rate = env.goal.rate_hz
+
+    def figures(self) -> dict[str, float]:
+        stays, tilt = self._sums
+        return {
+            "stays_s": float(stays.mean() / self._rate),
+            "stays_least_s": float(stays.amin() / self._rate),
+            "tilt_deg": math.degrees(float((tilt / stays.clamp_min(1.0)).mean())),
+        }
+
+
+class ChickenMeter:
+    """How far a blow pushes a player off, and its opponent, where that is one."""
+
+    words: Mapping[str, str] = {
+        "pushed_mm": f"Pelvis pushed off its way in {PUSHED_S:g} s from the first touch on, mean, mm",
+        "rival_pushed_mm": "The same of its opponent, mm",
+        "touched": "Episodes with a touch",
+        "rival_fell": "Episodes in which the opponent fell",
+    }
+
+    def begin(self, env: ImitationEnv) -> None:
+        self._part = part_of(env)
+        opposing = env.plugin(Opposing)
+        self._envs = [env] if opposing is None else [env, opposing.env]
+        n = env.num_envs
+        self._left = torch.full((n,), -1, dtype=torch.long)
+        self._from = torch.zeros(len(self._envs), n, 2)
+        self._way = torch.zeros(len(self._envs), n)
+        self._fell = torch.zeros(n, dtype=torch.bool)
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        off = torch.stack([_off(e) for e in self._envs])
+        felt = self._part.felt()
+        assert felt is not None
+        touched = (felt.force.norm(dim=-1) > TOUCHES_N).any(1)
+        begins = touched & (self._left < 0)
+        self._from[:, begins] = off[:, begins]
+        self._left[begins] = round(PUSHED_S * env.goal.rate_hz)
+        ends = self._left == 1
+        self._way[:, ends] = (off - self._from).norm(dim=-1)[:, ends]
+        self._left = torch.where(self._left > 0, self._left - 1, self._left)
+        if len(self._envs) > 1:
+            height = self._envs[1].pose().pos[:, 0, 2]
+            if step == 0:
+                self._stood = height.clone()
+            self._fell |= height < FALLEN * self._stood
+
+    def figures(self) -> dict[str, float]:
+        counts = self._left == 0
+        ways = self._way[:, counts].mean(1) if bool(counts.any()) else self._way[:, 0] * 0.0
+        return {
+            "pushed_mm": 1000.0 * float(ways[0]),
+            "rival_pushed_mm": 1000.0 * float(ways[1]) if len(ways) > 1 else 0.0,
+            "touched": float((self._left >= 0).sum()),
+            "rival_fell": float(self._fell.sum()),
+        }
+
+
+def _off(env: ImitationEnv) -> Tensor:
+    """`(N, 2)` m, the pelvis from where the motion has it, which does not give way."""
+    goal = env.goal.goal if isinstance(env.goal, DisplacedGoal) else env.goal
+    return (env.pose().pos[:, 0] - goal.layout.unpacked(goal.now()).pos[:, 0])[:, :2]
+
+
+METERS: Mapping[type[PlayScene], Callable[[], Meter]] = {
+    Doorway: DoorMeter, Trampoline: TrampolineMeter, Balance: BallMeter,
+    Chicken: ChickenMeter,
+}  # fmt: skip
+
+
+def meter_of(scene: PlayScene) -> Meter | None:
+    """The meter of a scene, None where it has no figures of its own."""
+    make = METERS.get(type(scene))
+    return None if make is None else make()
+
+
+def words_of(scene: PlayScene) -> Mapping[str, str]:
+    """What the figures of a scene's own are."""
+    made = meter_of(scene)
+    return {} if made is None else made.words

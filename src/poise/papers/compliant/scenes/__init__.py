@@ -1,13 +1,9 @@
 """Scenes in which a character gives way, one file each."""
 
 from poise.papers.compliant.scenes.ball import Balance
-from poise.papers.compliant.scenes.chicken import Chicken
+from poise.papers.compliant.scenes.body_scenes import Chicken, Hands, Pull, Throws, Trampoline
 from poise.papers.compliant.scenes.door import Doorway
-from poise.papers.compliant.scenes.hands import Hands
-from poise.papers.compliant.scenes.pull import Pull
 from poise.papers.compliant.scenes.stage import PlayScene, Stage, hand_of
-from poise.papers.compliant.scenes.throws import Throws
-from poise.papers.compliant.scenes.trampoline import Trampoline
 
 #: The scenes by their names.
 SCENES: dict[str, type[PlayScene]] = {

@@ -12,18 +12,19 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, Pushes, Switch, near
-from poise.env.events.event import Drawn
+from poise.env.events import Drawn, InScene
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
-from poise.env.goals.displaced import DisplacedGoal
-from poise.env.goals.goal import Goal
+from poise.env.goal import Goal
 from poise.env.plugins import Felt, Plugin
+from poise.env.pushes import Pushes
 from poise.env.reference import Reference
+from poise.env.things import Switch, near
+from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
+from poise.motion.rotations import heading_quat, into_heading, quat_rotate
 from poise.papers.compliant.scenes.stage import Given, Stage
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
 from poise.sim.props import Rod
-from poise.spatial import heading_quat, into_heading, quat_rotate
 
 #: Sharpness of the reward, 1/m^2 (Sec. 5.4).
 SHARPNESS = 2.0

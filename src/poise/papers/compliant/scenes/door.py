@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.events import Happening, InScene, ScenePart, SetDown
+from poise.env.events import Happening, InScene, ScenePart
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
+from poise.env.things import SetDown
 from poise.errors import PoiseError
+from poise.motion.rotations import quat_conj, quat_rotate
 from poise.papers.compliant.scenes.stage import Stage, hand_of
 from poise.sim import Link, SceneSim
 from poise.sim.props import Door
-from poise.spatial import quat_conj, quat_rotate
 
 #: s of the motion: the hand is at the knob, lets go of it, and the motion ends; how wide it opens, rad.
 GRIPS_S, LETS_GO_S, LASTS_S, OPENS = 1.4, 4.2, 5.0, 0.8

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
 from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
-from poise.env.goals.goal import Goal
+from poise.env.goal import Goal
 from poise.env.plugins import Plugin
 from poise.env.reference import Reference
 from poise.errors import PoiseError

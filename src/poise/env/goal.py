@@ -1,0 +1,319 @@
+"""What N characters are to do, told as it goes; and clips as goals."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.env.bins import Outcomes
+from poise.env.frame import Layout
+from poise.env.reference import Reference, Start
+from poise.env.starts import Starts
+from poise.errors import PoiseError
+from poise.sim import displaced
+
+#: s in which an extrapolated motion comes to rest: its velocity falls by e in each.
+FADE_S = 0.1
+
+Group = Literal["all", "clip", "bin"]
+
+
+class Goal(ABC):
+    """What N characters are to do.
+
+    Attributes:
+        humanoid: the goal is in its coordinates; the first of `bodies`.
+        bodies: all bodies, of the same joints and hinges.
+        rate_hz: control steps a second.
+        layout: where the numbers of packed poses `(N, W)` stand, see `Layout`.
+        num_envs: N.
+        device: where its tensors are.
+        rng: of all draws that starts make, on the CPU.
+        notes: sentences on what went wrong, in order; a stream that stalls, for instance.
+    """
+
+    humanoid: Humanoid
+    bodies: tuple[Humanoid, ...]
+    rate_hz: float
+    layout: Layout
+    num_envs: int
+    device: torch.device
+    rng: torch.Generator
+    notes: list[str]
+    #: Whether the goal is known before the first episode, so that characters can be set down on it.
+    begins: bool = False
+
+    @abstractmethod
+    def local(self, qpos: Tensor) -> Tensor:
+        """`(N, J, 4)` wxyz local turns of the hinged bodies of `qpos (N, 7 + n)`, on `device`."""
+
+    # --- episodes -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def draw(self, ids: Tensor) -> None:
+        """Chooses what the worlds `ids (n,)` are to do in their next episodes."""
+
+    def seek(self, clip: Tensor, frame: Tensor) -> None:
+        """World i goes on at `frame[i]` of `clip[i]`, both `(N,)`, wherever its character stands.
+
+        Raises:
+            PoiseError: the goal follows no clips.
+        """
+        self.clips.seek(clip, frame)
+
+    @abstractmethod
+    def start(self, ids: Tensor | None) -> Start:
+        """Coordinates in which episodes of worlds `ids`, all for None, begin on the goal."""
+
+    @abstractmethod
+    def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
+        """Looks up what comes next in worlds `ids`, all for None, after they have been set down.
+
+        held: `(N,)` bool, worlds with goals that wait in the next step; None: no goal waits.
+        """
+
+    def body(self, ids: Tensor | None) -> Tensor:
+        """`(n,)` which of `bodies` the characters of worlds `ids` need."""
+        count = self.num_envs if ids is None else len(ids)
+        return torch.zeros(count, dtype=torch.long, device=self.device)
+
+    # --- frames -------------------------------------------------------------------------------
+
+    @abstractmethod
+    def now(self, ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, W)` that the characters are to be in now."""
+
+    @abstractmethod
+    def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, W)` of k control steps later; extrapolated where they are not known."""
+
+    def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, K, W)` of so many control steps later; what a stream does not know yet is
+        told as the last frame that it knows."""
+        return torch.stack([self.ahead(k, ids) for k in steps], 1)
+
+    @abstractmethod
+    def targets(self) -> tuple[Tensor, Tensor]:
+        """Hinge angles of `ahead(1)`, rad float64, as a table `(R, n)` and its rows `(N,)`."""
+
+    @abstractmethod
+    def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
+        """One control step has been made; `now()` and `ahead(1)` of all worlds.
+
+        waited, held: `(N,)` bool, worlds with goals that waited in this step, and that wait in the next.
+        """
+
+    def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
+        """Looks where the characters are, before a policy acts; True if goals changed by that.
+
+        qpos `(N, 7 + n)`; pos `(N, B, 3)` m and linvel `(N, B, 3)` m/s of their bodies.
+        """
+        return False
+
+    # --- what is counted ----------------------------------------------------------------------
+
+    def groups(self, by: Group) -> int:
+        """How many groups of outcomes there are, see `HelpBudget`."""
+        return 1
+
+    def group(self, by: Group) -> Tensor:
+        """`(N,)` the group of each world in the present step."""
+        return torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    def row(self) -> Tensor:
+        """`(N,)` where in the goal's own table the worlds are, for `outcomes`."""
+        return torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
+        """What a step that led to `row (N,)` says of motion bins, see `MotionBins.outcomes`."""
+        raise PoiseError("this goal has no motion bins", hint="Take help_by='all' and adaptive=0")
+
+    @property
+    def clips(self) -> ClipGoal:
+        """The clips that the goal is made of.
+
+        Raises:
+            PoiseError: it is made of none.
+        """
+        raise PoiseError(f"a {type(self).__name__} follows no clips")
+
+    def where(self, env: int) -> str:
+        """Which part of the goal world `env` is at, for messages."""
+        return type(self).__name__
+
+    # --- persistence --------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a bit-exact continuation needs."""
+        return {**{f"goal/{k}": v.clone() for k, v in self.rows().items()}, "rng": self.rng.get_state()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from `state()`."""
+        for name, value in self.rows().items():
+            value.copy_(state[f"goal/{name}"])
+        self.rng.set_state(state["rng"])
+
+    @abstractmethod
+    def rows(self) -> dict[str, Tensor]:
+        """What it knows of each world, `(N, ...)` by name: tensors that a snapshot copies in place."""
+
+    def shared(self) -> dict[str, Tensor]:
+        """What `rows` points into, by name: never changed in place, so that a snapshot holds it."""
+        return {}
+
+    def load_shared(self, shared: Mapping[str, Tensor]) -> None:  # noqa: B027 - most share nothing
+        """Takes what another goal of the kind has as `shared()`, for all worlds."""
+
+
+def extrapolated(qpos: Tensor, qvel: Tensor, steps: Tensor, rate_hz: float) -> Start:
+    """Where a motion goes on that is known up to `qpos (n, 7 + n)` with `qvel (n, 6 + n)`.
+
+    Its velocity fades, q = q_0 + v_0 tau (1 - e^(-t / tau)), v = v_0 e^(-t / tau) with tau = `FADE_S`,
+    so that a character comes to rest where it was heading if its goals stop arriving.
+
+    steps: `(n,)` control steps beyond the last known frame.
+    """
+    left = torch.exp(-steps.to(qpos) / (rate_hz * FADE_S)).unsqueeze(-1)
+    return displaced(qpos, qvel * (FADE_S * (1.0 - left))), qvel * left
+
+
+#: Frames behind the end of a clip at which a character that waits there may stand.
+BEHIND = 100_000
+
+
+class ClipGoal(Goal):
+    """Every world follows one of the reference's clips.
+
+    Attributes:
+        reference: the clips.
+        clip, frame: `(N,)` which clip each world follows, and the frame that it is at.
+        starts: draws where episodes begin.
+        odds: gives the odds of motion bins with which starts are drawn, see `Starts.draw`; None: none.
+    """
+
+    def __init__(self, reference: Reference, num_envs: int, device: torch.device, starts: Starts):
+        self.reference = reference = reference.to(device)
+        self.humanoid, self.bodies = reference.humanoid, reference.bodies
+        self.rate_hz, self.layout = reference.rate_hz, reference.layout
+        self.num_envs, self.device, self.starts = num_envs, device, starts
+        self.rng, self.notes = starts.rng, []
+        self.odds: Callable[[], Tensor] | None = None
+        self.clip = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)
+        # The rows of what comes next, and its packed poses as policies are told them.
+        self._rows, self._ahead = self.clip.clone(), reference.packed(self.clip)
+
+    begins = True
+
+    @property
+    def clips(self) -> ClipGoal:
+        return self
+
+    def local(self, qpos: Tensor) -> Tensor:
+        return self.reference.local(qpos)
+
+    def drawn(self, by: Group) -> Tensor:
+        """`(G,)` bool, groups of clips that episodes draw."""
+        used = self.starts.weights > 0
+        return used[self.reference.bins.clip.cpu()] if by == "bin" else used
+
+    def draw(self, ids: Tensor) -> None:
+        odds = None if self.odds is None else self.odds()
+        pick, frame = (x.to(self.device) for x in self.starts.draw(len(ids), odds))
+        self.clip[ids], self.frame[ids] = pick, frame
+
+    def seek(self, clip: Tensor, frame: Tensor) -> None:
+        """World i goes on at `frame[i]` of `clip[i]`, both `(N,)`, wherever its character stands."""
+        self.clip.copy_(clip)
+        self.frame.copy_(frame)
+
+    def start(self, ids: Tensor | None) -> Start:
+        if ids is None:
+            return self.reference.coordinates(self.clip, self.frame)
+        return self.reference.coordinates(self.clip[ids], self.frame[ids])
+
+    def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
+        ahead = self.frame + 1 if held is None else self.frame + 1 - held.long()
+        if ids is None:
+            self._rows = self.reference.rows(self.clip, ahead)
+            self._ahead = self.reference.gather_packed(self.clip, ahead, self._rows, told=True)
+        else:
+            clip, ahead = self.clip[ids], ahead[ids]
+            self._rows[ids] = self.reference.rows(clip, ahead)
+            self._ahead[ids] = self.reference.gather_packed(clip, ahead, told=True)
+
+    def body(self, ids: Tensor | None) -> Tensor:
+        return self.reference.body[self.clip if ids is None else self.clip[ids]]
+
+    def now(self, ids: Tensor | None = None) -> Tensor:
+        if ids is None:
+            return self.reference.gather_packed(self.clip, self.frame)
+        return self.reference.gather_packed(self.clip[ids], self.frame[ids])
+
+    def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
+        if k == 1:
+            return self._ahead if ids is None else self._ahead[ids]
+        clip, frame = (self.clip, self.frame) if ids is None else (self.clip[ids], self.frame[ids])
+        return self.reference.gather_packed(clip, frame + k, told=True)
+
+    def targets(self) -> tuple[Tensor, Tensor]:
+        return self.reference.hinges, self._rows
+
+    def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
+        self.frame += 1
+        if waited is not None:
+            self.frame.sub_(waited.long())
+        now = self._ahead
+        if self.reference.misleads:
+            now = self.reference.gather_packed(self.clip, self.frame, self._rows)
+        self._rows, self._ahead = self.reference.follow(self._rows, self.clip, self.frame, held)
+        return now, self._ahead
+
+    def groups(self, by: Group) -> int:
+        return {"all": 1, "clip": len(self.reference.length), "bin": len(self.reference.bins)}[by]
+
+    def group(self, by: Group) -> Tensor:
+        return self.reference.bins.of[self._rows] if by == "bin" else self.clip
+
+    def row(self) -> Tensor:
+        return self._rows
+
+    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
+        return self.reference.bins.outcomes(row, age, failed, done)
+
+    def where(self, env: int) -> str:
+        return f"{self.reference.names[int(self.clip[env])]} frame {int(self.frame[env])}"
+
+    def state(self) -> dict[str, Tensor]:
+        return {
+            "clip": self.clip.clone(),
+            "frame": self.frame.clone(),
+            "weights": self.starts.weights,
+            "rng": self.rng.get_state(),
+        }
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        self._check(state["clip"], state["frame"])
+        self.seek(state["clip"], state["frame"])
+        if "weights" in state:  # States of former versions are without; their odds never changed.
+            self.starts.weights = state["weights"]
+        self.rng.set_state(state["rng"])
+
+    def _check(self, clip: Tensor, frame: Tensor) -> None:
+        """Refuses clips that are not there, and frames before the first or far behind the last."""
+        clip, frame = clip.to(self.device), frame.to(self.device)
+        known = (clip >= 0) & (clip < len(self.reference.length)) & (frame >= 0)
+        place = clip * known
+        known &= self.reference.cyclic[place] | (frame < self.reference.length[place] + BEHIND)
+        if not known.all():
+            at = int((~known).nonzero()[0, 0])
+            what = f"frame {int(frame[at])} of clip {int(clip[at])}"
+            raise PoiseError(f"environment {at} stands at {what}, which is not there")
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"clip": self.clip, "frame": self.frame}

@@ -1,0 +1,254 @@
+"""Pushes: one at a stated time, or several at random times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.env.goal import Goal
+from poise.env.plugins import Felt, Plugin
+from poise.env.reference import Start
+from poise.errors import PoiseError
+from poise.sim import Backend, Drive
+
+
+@dataclass(frozen=True)
+class Push:
+    """A constant force on one body for some time of each episode; given to `TaskConfig.plugins`.
+
+    Attributes:
+        row: of the body table; the force acts at the body's inertial centre.
+        force: N, world axes.
+        first: the control step of the episode in which it begins.
+        steps: control steps that it lasts.
+        foreseen: whether it begins and ends in this environment by itself. Copies in which a controller
+            looks ahead take False: they feel what acts where they were copied, as long as they last,
+            and know of no push to come.
+    """
+
+    row: int
+    force: tuple[float, float, float]
+    first: int
+    steps: int
+    foreseen: bool = True
+
+    def __post_init__(self) -> None:
+        if self.row < 0 or self.first < 0 or self.steps < 1:
+            raise PoiseError("row and first must be at least 0, steps at least 1", "Push")
+        if not all(math.isfinite(f) for f in self.force):
+            raise PoiseError(f"the force is not finite: {self.force}", "Push")
+
+    def __call__(self, goal: Goal, backend: Backend) -> OnePush:
+        """The plug-in of an environment."""
+        bodies = len(goal.humanoid.bodies)
+        if self.row >= bodies:
+            raise PoiseError(f"the body has {bodies} parts, there is no row {self.row}", "Push")
+        return OnePush(self, backend)
+
+
+class OnePush(Plugin):
+    """The push on the characters of a backend.
+
+    Attributes:
+        step: `(N,)` control steps of each episode that were made.
+        acts: `(N,)` bool, characters that are pushed in the next control step.
+    """
+
+    def __init__(self, push: Push, backend: Backend):
+        self.given, self._backend = push, backend
+        n, here = backend.num_envs, backend.device
+        self.step = torch.zeros(n, dtype=torch.long, device=here)
+        self.acts = torch.zeros(n, dtype=torch.bool, device=here)
+        self._force = torch.tensor(push.force).to(backend.drive.xfrc_applied)
+        self._know()
+
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        """Episodes begin before the push."""
+        self.step[slice(None) if ids is None else ids] = 0
+        self._know()
+        return start
+
+    def push(self, drive: Drive) -> None:
+        """Adds the force."""
+        drive.xfrc_applied[self.acts, self.given.row + 1, :3] += self._force
+
+    def felt(self) -> Felt:
+        """The push, where it acts."""
+        n, body = len(self.acts), self.given.row + 1
+        rows = torch.full((n, 1), body, dtype=torch.long, device=self.acts.device)
+        force = self._force * self.acts.unsqueeze(1)
+        return Felt(rows, self._backend.state.xipos[:, body : body + 1], force.unsqueeze(1))
+
+    def tick(self) -> None:
+        """Counts on."""
+        self.step += 1
+        self._know()
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"one push/step": self.step, "one push/acts": self.acts}
+
+    def state(self) -> dict[str, Tensor]:
+        """Where the episodes are."""
+        return {k: v.clone() for k, v in self.rows().items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from there; from a task without this push from the begin of its time."""
+        for name, value in self.rows().items():
+            if name in state:
+                value.copy_(state[name])
+
+    def _know(self) -> None:
+        if self.given.foreseen:
+            first = self.given.first
+            self.acts.copy_((self.step >= first) & (self.step < first + self.given.steps))
+
+
+#: Control steps until a push of an episode that has none.
+NEVER = 10**9
+
+
+@dataclass(frozen=True)
+class Pushes:
+    """Pushes on random bodies at random times, each of a random horizontal direction; given to
+    `TaskConfig.plugins`.
+
+    Attributes:
+        newtons: between which the force is drawn, N.
+        every_s: between which the time from one push's end to the next one's begin is drawn, s.
+        lasts_s: how long each lasts, s; two: between which that is drawn, evenly in its logarithm.
+        share: of the episodes that have pushes.
+        impulse_ns: N s that none has more of; long pushes are as much weaker.
+        bodies: rows of the body table of which one is pushed at its inertial centre.
+        control_hz: control steps per second.
+        seed: of the draws.
+    """
+
+    newtons: tuple[float, float] = (50.0, 200.0)
+    every_s: tuple[float, float] = (1.0, 3.0)
+    lasts_s: float | tuple[float, float] = 0.2
+    bodies: tuple[int, ...] = (0,)
+    control_hz: float = 30.0
+    seed: int = 0
+    share: float = 1.0
+    impulse_ns: float = float("inf")
+
+    def __post_init__(self) -> None:
+        for name in ("newtons", "every_s"):
+            low, high = getattr(self, name)
+            if not 0.0 <= low <= high < float("inf"):
+                raise PoiseError(f"{name} must rise from at least 0, got {low:g} to {high:g}", "Pushes")
+        low, high = self.lasting
+        if not (0.0 < low <= high and self.control_hz > 0.0 and self.impulse_ns > 0.0):
+            raise PoiseError("lasts_s, control_hz and impulse_ns must be above 0", "Pushes")
+        if not 0.0 <= self.share <= 1.0:
+            raise PoiseError(f"share must lie in 0 to 1, got {self.share:g}", "Pushes")
+        if not self.bodies:
+            raise PoiseError("pushes need at least one body", "Pushes")
+
+    @property
+    def lasting(self) -> tuple[float, float]:
+        """The least and the most s that a push lasts."""
+        given = self.lasts_s
+        return given if isinstance(given, tuple) else (given, given)
+
+    def __call__(self, goal: Goal, backend: Backend) -> Pushing:
+        """The plug-in of an environment."""
+        return Pushing(self, backend)
+
+
+class Pushing(Plugin):
+    """The pushes on the characters of a backend.
+
+    Attributes:
+        left: `(N,)` control steps until a push begins; from 0 down those that it has lasted.
+        lasts: `(N,)` control steps of the next or present push.
+        force: `(N, 3)` N of the next or present push, world axes.
+        body: `(N,)` MuJoCo's body that it is on.
+    """
+
+    def __init__(self, pushes: Pushes, backend: Backend):
+        self.pushes, n, here = pushes, backend.num_envs, backend.device
+        self._backend = backend
+        self._rng = torch.Generator().manual_seed(pushes.seed)
+        self.left = torch.zeros(n, dtype=torch.long, device=here)
+        self.lasts = torch.zeros_like(self.left)
+        self.body = torch.zeros(n, dtype=torch.long, device=here)
+        self.force = torch.zeros(n, 3, dtype=backend.drive.xfrc_applied.dtype, device=here)
+        self._draw(torch.arange(n, device=here))
+
+    @property
+    def acting(self) -> Tensor:
+        """`(N,)` bool, characters that are pushed in this control step."""
+        return self.left <= 0
+
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        """Episodes begin with a time without a push; some have none at all."""
+        rows = torch.arange(len(self.left), device=self.left.device) if ids is None else ids
+        self._draw(rows)
+        if self.pushes.share < 1.0:
+            none = torch.rand(len(rows), generator=self._rng) >= self.pushes.share
+            self.left[rows[none.to(rows.device)]] = NEVER
+        return start
+
+    def push(self, drive: Drive) -> None:
+        """Adds the force of each push."""
+        rows = self.acting.nonzero().squeeze(-1)
+        drive.xfrc_applied[rows, self.body[rows], :3] += self.force[rows]
+
+    def felt(self) -> Felt:
+        """The pushes that act."""
+        force = self.force * self.acting.unsqueeze(1)
+        point = self._backend.state.xipos.gather(1, self.body.view(-1, 1, 1).expand(-1, 1, 3))
+        return Felt(self.body.unsqueeze(1), point, force.unsqueeze(1))
+
+    def tick(self) -> None:
+        """Counts down, and draws the next push where one is over."""
+        self.left -= 1
+        self._draw((self.left <= -self.lasts).nonzero().squeeze(-1))
+
+    def rows(self) -> dict[str, Tensor]:
+        return {
+            "push/left": self.left,
+            "push/lasts": self.lasts,
+            "push/body": self.body,
+            "push/force": self.force,
+        }
+
+    def state(self) -> dict[str, Tensor]:
+        """The pushes, and the generator of those to come."""
+        rows = {k: v.clone() for k, v in self.rows().items()}
+        return {**rows, "push/rng": self._rng.get_state()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on with the same pushes; from a task without pushes with those it has."""
+        if "push/rng" in state:
+            for name, value in self.rows().items():
+                if name in state:
+                    value.copy_(state[name])
+            self._rng.set_state(state["push/rng"])
+
+    def _draw(self, ids: Tensor) -> None:
+        p, n = self.pushes, len(ids)
+        unit = torch.rand(3, n, generator=self._rng)
+        pick = torch.randint(len(p.bodies), (n,), generator=self._rng)
+        wait = p.every_s[0] + (p.every_s[1] - p.every_s[0]) * unit[0]
+        size = p.newtons[0] + (p.newtons[1] - p.newtons[0]) * unit[1]
+        angle = 2 * torch.pi * unit[2]
+        low, high = p.lasting
+        lasts = torch.full((n,), low)
+        if high > low:
+            lasts = low * (high / low) ** torch.rand(n, generator=self._rng)
+        size = size.clamp_max(p.impulse_ns / lasts)
+        force = torch.stack((size * angle.cos(), size * angle.sin(), 0 * size), 1)
+        self.left[ids] = (wait * p.control_hz).round().long().clamp_min(1).to(self.left.device)
+        self.lasts[ids] = (lasts * p.control_hz).round().long().clamp_min(1).to(self.left.device)
+        self.force[ids] = force.to(self.force)
+        self.body[ids] = (torch.tensor(p.bodies)[pick] + 1).to(self.body.device)

@@ -1,1 +1,0 @@
-"""Feet: when they are in contact, and how they are held there."""

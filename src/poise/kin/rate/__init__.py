@@ -1,1 +1,0 @@
-"""The frame rate that a motion has by physics: three kinds of evidence, and a judgement."""

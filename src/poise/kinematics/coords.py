@@ -1,0 +1,263 @@
+"""A clip in one humanoid's generalized coordinates and back; rotations as chains of hinges."""
+
+from __future__ import annotations
+
+import math
+from itertools import accumulate
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable, Humanoid
+from poise.errors import PoiseError
+from poise.motion import Clip, Skeleton
+from poise.motion.rotations import (
+    euler_to_quat,
+    forward_kinematics,
+    normalize,
+    quat_between,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    quat_to_euler,
+    quat_to_rotvec,
+    unwrap_quats,
+)
+
+
+def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
+    """Rotation `(..., 4)` of a hinge chain: `frame * R_order(angles) * frame^-1`.
+
+    angles: `(..., n)` rad, outermost hinge first. order: axis letters of `frame`, "" to "ZYX".
+    """
+    return quat_mul(quat_mul(frame, euler_to_quat(angles, order)), quat_conj(frame))
+
+
+def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None = None) -> Tensor:
+    """Hinge angles `(T, n)` rad of the chain that comes nearest to `rot (T, 4)`, continuous in time.
+
+    Three hinges reproduce any rotation. Of the two Euler branches (a, b, c) and
+    (a + pi, pi - b, c + pi) the sequence with the smallest sum of squared steps is found
+    (`euler_path`); whole turns are unwrapped, so a pirouette counts up. Two hinges drop the missing
+    third angle and one hinge takes the twist about its axis: both exact for rotations that lie in
+    the chain. The whole sequence is shifted by full turns to lie nearest `prefer (n)` (default 0).
+    """
+    local = quat_mul(quat_between(frame, rot), frame)
+    if not order:
+        return local.new_zeros(*local.shape[:-1], 0)
+    if len(order) == 1:
+        axis = 1 + "XYZ".index(order)
+        raw = 2.0 * torch.atan2(local[:, axis], local[:, 0])
+        path = raw.unsqueeze(-1)
+    elif len(order) == 2:
+        missing = next(c for c in "XYZ" if c not in order)
+        path = quat_to_euler(local, order[0] + missing + order[1])[:, [0, 2]]
+    else:
+        free = through_lock(quat_to_euler(local, order), order).numpy()
+        path = torch.tensor(
+            euler_path(free[:, None], None if prefer is None else prefer.numpy()[None])[:, 0]
+        )
+    path = torch.tensor(np.unwrap(path.numpy(), axis=0))
+    centre = torch.zeros(len(order), dtype=path.dtype) if prefer is None else prefer
+    turns = torch.round((path.median(0).values - centre) / (2 * math.pi))
+    return path - turns * 2 * math.pi
+
+
+def through_lock(angles: Tensor, order: str) -> Tensor:
+    """Euler angles `(T, 3)`, the third angle held through frames exactly at gimbal lock.
+
+    There only the sum a +- c is known and `quat_to_euler` sets c to zero, which would be a jump.
+    """
+    # At b = +-90 degrees R_i(a) R_j(b) R_k(c) = R_i(a +- s c) R_j(b), s the parity of the order.
+    locked = (angles[:, 2] == 0.0) & (angles[:, 1].abs() > math.pi / 2 - 1e-6)
+    if not bool(locked.any()) or bool(locked.all()):
+        return angles
+    free = (~locked).nonzero().squeeze(-1)
+    at = torch.arange(len(angles))
+    # The nearest free frame before, or the first one.
+    held = angles[free[(torch.searchsorted(free, at, right=True) - 1).clamp_min(0)], 2]
+    parity = 1.0 if order in ("XYZ", "YZX", "ZXY") else -1.0
+    first = angles[:, 0] - parity * angles[:, 1].sign() * held
+    out = angles.clone()
+    out[:, 0] = torch.where(locked, first, angles[:, 0])
+    out[:, 2] = torch.where(locked, held, angles[:, 2])
+    return out
+
+
+def within_turns(qpos: np.ndarray, humanoid: Humanoid) -> np.ndarray:
+    """`qpos (T, 7 + n)` with hinges that lie outside their ranges shifted by the whole turns that bring
+    them nearest. A range may have room for several turns: a hinge that lies in it stays where it is."""
+    low, high = humanoid.model.jnt_range[1:].T
+    mean = qpos[:, 7:].mean(0)
+    turns = np.round((mean - (low + high) / 2) / (2 * np.pi))
+
+    def outside(angle: np.ndarray) -> np.ndarray:
+        return np.maximum(np.maximum(low - angle, angle - high), 0.0)
+
+    nearer = outside(mean - 2 * np.pi * turns) < outside(mean)
+    out = qpos.copy()
+    out[:, 7:] -= 2 * np.pi * np.where(nearer, turns, 0.0)
+    return out
+
+
+def best_path(price: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """The cheaper of two candidates in every frame `(T, R)`, over the whole sequence.
+
+    Args:
+        price: `(T - 1, R, 2, 2)`, what the step from candidate i to candidate j costs.
+        pull: `(T, R, 2)`, what a candidate costs by itself.
+
+    The sequence of least sum is the shortest path of Viterbi's algorithm. Its costs are products of
+    2 x 2 matrices in the algebra of minimum and sum, which is associative, so prefixes and suffixes of
+    all frames come in log2(T) passes; a frame takes the candidate through which the best path leads.
+    """
+    if len(pull) == 1:
+        return pull.argmin(-1)
+    steps = price + pull[1:, :, None, :]
+    first = pull[:1, :, :, None] + np.array([[0.0, np.inf], [np.inf, 0.0]])
+    come = _prefix(np.concatenate((first, steps))).min(-2)
+    # Suffixes are prefixes of the reversed, transposed steps.
+    back = np.swapaxes(steps[::-1], -1, -2)
+    go = np.concatenate((_prefix(back).min(-2)[::-1], np.zeros_like(pull[:1])))
+    return (come + go).argmin(-1)
+
+
+def _prefix(m: np.ndarray) -> np.ndarray:
+    """All prefix products `(T, R, 2, 2)` in the algebra of minimum and sum (Hillis and Steele 1986)."""
+    out, reach = m.copy(), 1
+    while reach < len(out):
+        a, b = out[:-reach], out[reach:]
+        # (a b)_ij = min_k a_ik + b_kj
+        joined = np.minimum(
+            a[..., :, :1] + b[..., :1, :],
+            a[..., :, 1:] + b[..., 1:, :],
+        )
+        out = np.concatenate((out[:reach], joined))
+        reach *= 2
+    return out
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles (rad) brought into [-pi, pi)."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+
+
+def euler_path(first: np.ndarray, prefer: np.ndarray | None = None) -> np.ndarray:
+    """Euler angles `(T, R, 3)` on the smoothest sequence through their two branches, not unwrapped.
+
+    The branches (a, b, c) and (a + pi, pi - b, c + pi) are the same rotation. A slight pull toward
+    `prefer (R, 3)` (default 0) breaks ties and chooses the branch of a still clip.
+    """
+    shift = np.array([np.pi, 0.0, np.pi])
+    second = first * np.array([1.0, -1.0, 1.0]) + shift + np.array([0.0, np.pi, 0.0])
+    both = np.stack((first, second), -2)  # (T, R, 2, 3)
+    step = wrapped(both[1:, :, None, :, :] - both[:-1, :, :, None, :])
+    home = wrapped(both - (0.0 if prefer is None else prefer[:, None, :]))
+    pick = best_path((step**2).sum(-1), 1e-4 * (home**2).sum(-1))
+    return np.take_along_axis(both, pick[..., None, None], -2)[..., 0, :]
+
+
+def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
+    """`(T, 7 + hinges)`: root position m, root quaternion wxyz, hinge angles rad.
+
+    World rotations of the carried joints are matched exactly where the chain has three hinges; the
+    root follows the pelvis. Angles are continuous and may exceed +-pi.
+    """
+    skeleton, rows = clip.skeleton, table.rows
+    if len(skeleton) <= max(r.joint for r in rows) or any(
+        skeleton.names[r.joint] != r.name for r in rows
+    ):
+        raise PoiseError(
+            f"its joints ({', '.join(skeleton.names[:6])}, ...) are not those of this character "
+            f"({', '.join(r.name for r in rows[:6])}, ...)",
+            clip.name,
+        )
+    pos, quat = forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *clip.tensors())
+    pelvis = rows[0].joint
+    columns = [pos[:, pelvis], unwrap_quats(quat[:, pelvis])]
+    for row in rows[1:]:
+        anchor = rows[row.parent].joint
+        rel = quat_between(quat[:, anchor], quat[:, row.joint])
+        rest = torch.tensor(row.quat, dtype=torch.float64)
+        rot = quat_between(rest, rel)
+        columns.append(chain_angles(rot, row.order, torch.tensor(row.frame, dtype=torch.float64)))
+    return torch.cat(columns, -1).numpy()
+
+
+def qpos_to_clip(
+    qpos: np.ndarray,
+    table: BodyTable,
+    skeleton: Skeleton,
+    fps: float,
+    template: Clip | None = None,
+    name: str = "simulated",
+) -> Clip:
+    """The motion `qpos (T, 7 + hinges)` on `skeleton`, every joint of it.
+
+    Joints without a body of their own (toes, fingers, helpers) and turns that a chain cannot make
+    take their local rotation from `template` frame by frame (the clip that was imitated, same frame
+    count), or identity without one.
+    """
+    rows, q = table.rows, torch.tensor(np.asarray(qpos), dtype=torch.float64)
+    frames = len(q)
+    if template is None:
+        rot = torch.zeros(frames, len(skeleton), 4, dtype=torch.float64)
+        rot[..., 0] = 1.0
+    else:
+        if template.frames != frames:
+            raise PoiseError(f"the template has {template.frames} frames and the motion {frames}", name)
+        rot = template.tensors()[1]
+    pelvis = rows[0].joint
+    # Joints above the pelvis keep their rotation; the pelvis' own takes up the difference.
+    above = skeleton.ancestors(pelvis)[::-1]
+    world: dict[int, torch.Tensor] = {}
+    lead = torch.zeros(frames, 4, dtype=torch.float64)
+    lead[:, 0] = 1.0
+    shift = torch.zeros(frames, 3, dtype=torch.float64)
+    for j in above:
+        if skeleton.parents[j] >= 0:
+            shift = shift + quat_rotate(lead, torch.tensor(skeleton.offsets[j]).expand(frames, 3))
+        lead = quat_mul(lead, rot[:, j])
+    if above:
+        shift = shift + quat_rotate(lead, torch.tensor(skeleton.offsets[pelvis]).expand(frames, 3))
+    root_pos = q[:, :3] - shift
+    world[pelvis] = normalize(q[:, 3:7])
+    rot[:, pelvis] = quat_between(lead, world[pelvis])
+    by_joint = {r.joint: (i, r) for i, r in enumerate(rows)}
+    # First column of each row's hinges.
+    start = list(accumulate((len(r.order) for r in rows), initial=7))
+    for j in range(len(skeleton)):
+        parent = skeleton.parents[j]
+        if j == pelvis or j in above:
+            continue
+        if j in by_joint:
+            i, row = by_joint[j]
+            angles = q[:, start[i] : start[i] + len(row.order)]
+            frame = torch.tensor(row.frame, dtype=torch.float64)
+            if row.order:
+                rest = torch.tensor(row.quat, dtype=torch.float64).expand(frames, 4)
+                turn = chain_quat(angles, row.order, frame.expand(frames, 4))
+                anchor = world[rows[row.parent].joint]
+                full = quat_mul(anchor, quat_mul(rest, turn))
+                rot[:, j] = quat_between(world[parent], full)
+        world[j] = quat_mul(world.get(parent, lead), rot[:, j])
+    return Clip(skeleton, root_pos.numpy(), normalize(rot).numpy(), fps, name)
+
+
+def qpos_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
+    """`(T, nv)` velocity of `qpos (T, 7 + n)` in MuJoCo's convention.
+
+    Root linear velocity in the world frame (m/s), root angular velocity in the root's own frame
+    (rad/s), hinge speeds (rad/s). Central differences; one-sided at both ends.
+    """
+    q = torch.tensor(qpos, dtype=torch.float64)
+    frames = len(q)
+    ahead = torch.arange(frames).add(1).clamp(max=frames - 1)
+    behind = torch.arange(frames).sub(1).clamp(min=0)
+    dt = (ahead - behind).to(q.dtype).unsqueeze(-1) / fps
+    linear = (q[ahead, :3] - q[behind, :3]) / dt
+    # w_b = log(q_behind^-1 q_ahead) / dt, in the root's frame
+    turn = quat_to_rotvec(quat_between(q[behind, 3:7], q[ahead, 3:7])) / dt
+    hinges = (q[ahead, 7:] - q[behind, 7:]) / dt
+    return torch.cat((linear, turn, hinges), -1).numpy()

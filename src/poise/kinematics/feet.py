@@ -1,0 +1,277 @@
+"""Feet: when they touch the floor, and with which points; how high they stand, and level soles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from poise.body import BodyTable
+from poise.body.table import BodyRow, Geom
+from poise.kinematics.forward import carried
+from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
+from poise.motion import Clip
+from poise.motion.rotations import quat_between, quat_conj, quat_mul, quat_rotate, shortest_arc
+from poise.motion.smoothing import find_runs
+
+#: m/s: a point that touches is slower than the first; a whole foot that stands, than the second.
+TOUCH_SPEED, STAND_SPEED = 0.35, 0.4
+#: Height (m) over the ground under which slow toes and wrists touch it, in retargeting, and under which
+#: points of a sole are near it, in examinations (with a floor that is guessed).
+TOUCH_M, NEAR_M = {"foot": 0.05, "hand": 0.1}, 0.04
+#: Cosine of the tilt up to which a standing sole is level (20 degrees).
+LEVEL = 0.94
+#: Share of the frames, those in which a foot is lowest, of which the slow ones are taken to stand.
+LOWEST_SHARE = 0.3
+#: Rests higher than the median by more than this (m) are in the air.
+SAME_FLOOR_M = 0.02
+#: Heights (m) over the floor up to which a sole's end bears wholly, and from which not at all.
+BEARS_M, CLEAR_M = 0.015, 0.03
+#: A foot that gets this far (m) and is this fast (m/s) on average while it bears is dragged on purpose,
+#: or has fallen.
+DRAG_M, DRAG_SPEED = 0.15, 0.3
+#: Time (s) for which a sole that bears before and after may stop doing so.
+REST_GAP_S = 0.07
+
+
+class Sole(NamedTuple):
+    """World points of a foot: its ankle `(T, 3)` and the two ends of its sole `(T, 2, 3)`, m."""
+
+    ankle: Tensor
+    ends: Tensor
+
+
+def sole_boxes(table: BodyTable) -> Iterator[tuple[int, BodyRow, Geom]]:
+    """The feet that have a sole: the row's number, the row, and the box that is the sole."""
+    for i, row in enumerate(table.rows):
+        box = next((g for g in row.geoms if g.kind == "box"), None)
+        if row.kind == "foot" and box is not None:
+            yield i, row, box
+
+
+def soles_of(table: BodyTable, pos: Tensor, quat: Tensor) -> dict[int, Sole]:
+    """The soles of a body by their row of the table, from the rows' world poses `(T, B, 3 or 4)`."""
+    out = {}
+    for i, _, box in sole_boxes(table):
+        turn, middle = (torch.tensor(x, dtype=pos.dtype) for x in (box.quat, box.pos))
+        ends = []
+        for end in (-1.0, 1.0):
+            corner = carried(middle, turn, (end * box.size[0], 0.0, -box.size[2]))
+            ends.append(carried(pos[:, i], quat[:, i], corner))
+        out[i] = Sole(pos[:, i], torch.stack(ends, 1))
+    return out
+
+
+def point_speed(points: Tensor, fps: float) -> Tensor:
+    """`(T, ...)` m/s of points `(T, ..., 3)` m: central differences, one-sided at the ends."""
+    at = torch.arange(len(points))
+    ahead, behind = (at + 1).clamp(max=len(points) - 1), (at - 1).clamp(min=0)
+    dt = ((ahead - behind).to(points.dtype) / fps).reshape(-1, *[1] * (points.ndim - 1))
+    return ((points[ahead] - points[behind]) / dt).norm(dim=-1)
+
+
+def contact_labels(
+    points: Tensor,
+    fps: float,
+    height: float = TOUCH_M["foot"],
+    speed: float = TOUCH_SPEED,
+    ground: float = 0.0,
+) -> Tensor:
+    """Contact `(T, F)` bool of foot points `(T, F, 3)` m: low and slow.
+
+    A point is in contact when it is lower than `height` m above `ground` and moves slower than
+    `speed` m/s (central difference). Gaps and spells of a single frame are closed.
+    """
+    label = (point_speed(points, fps) < speed) & (points[..., 2] < ground + height)
+    if len(points) >= 3:
+        before, now, after = label[:-2], label[1:-1], label[2:]
+        # Majority of three frames.
+        middle = (before & now) | (now & after) | (before & after)
+        label = torch.cat((label[:1], middle, label[-1:]), 0)
+    return label
+
+
+def standing_labels(clips: Sequence[Tensor], fps: float) -> list[Tensor]:
+    """Contact `(T, F)` bool of the foot joints `(T, F, 3)` m of each clip, at heights told by the clips.
+
+    Rules that know only steps (`motion.windows.step_contacts`) hardly ever find a foot standing in
+    recordings with feet that slide by a few centimetres per second. Here a joint's own standing height,
+    the lowest tenth of its slow frames in all clips, counts, and per clip within 4 cm below and 6 cm
+    above of it, since floors differ; low is what is less than `NEAR_M` above that, slow as in
+    `contact_labels`.
+    """
+    usual = torch.stack([_standing(torch.cat([_slow(c[:, k], fps) for c in clips]))
+                         for k in range(clips[0].shape[1])])  # fmt: skip
+    out = []
+    for points in clips:
+        own = points[..., 2].quantile(0.1, dim=0)
+        limits = own.clamp(usual - 0.04, usual + 0.06) + NEAR_M
+        # Each joint has a floor of its own.
+        lowered = points.clone()
+        lowered[..., 2] -= limits
+        out.append(contact_labels(lowered, fps, 0.0))
+    return out
+
+
+def _slow(points: Tensor, fps: float) -> Tensor:
+    """Heights of those of the points `(T, 3)` that hardly move to the next frame."""
+    moved = torch.diff(points, dim=0).norm(dim=-1) * fps
+    return points[1:, 2][moved < TOUCH_SPEED]
+
+
+def _standing(heights: Tensor) -> Tensor:
+    if not len(heights):
+        return torch.zeros((), dtype=heights.dtype)
+    return heights.kthvalue(1 + len(heights) // 10).values
+
+
+def rest_height(points: Tensor, fps: float) -> float:
+    """The height (m) of the ground under points of the feet `(T, F, 3)`: the median of those at rest.
+
+    At rest is the lower point of a frame while it moves slower than `TOUCH_SPEED`; without any, the
+    tenth percentile of the lowest points counts.
+    """
+    low, which = points[..., 2].min(-1)
+    step = torch.diff(points, dim=0).norm(dim=-1) * fps
+    speed = torch.cat((step, step[-1:])).gather(1, which[:, None])[:, 0]
+    slow = low[speed < TOUCH_SPEED]
+    if len(slow) < 5:
+        return float(low.quantile(0.1))
+    # A foot may rest in the air too; the lower half of the moments of rest is on the floor.
+    return float(slow[slow <= slow.median() + SAME_FLOOR_M].median())
+
+
+def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> np.ndarray:
+    """Heights (m) of the middle of the soles in all frames in which a foot stands.
+
+    A foot stands when its sole is within 20 degrees of level, moves slower than `STAND_SPEED`, and is
+    among the lower half of such moments (a foot may also rest level in the air).
+    """
+    found: list[Tensor] = []
+    for i, _, box in sole_boxes(table):
+        turn = torch.tensor(box.quat, dtype=pos.dtype)
+        up = quat_rotate(turn, torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype))
+        sole = torch.tensor(box.pos, dtype=pos.dtype) - up * box.size[2]
+        point = carried(pos[:, i], quat[:, i], sole)
+        level = quat_rotate(quat[:, i], up.expand_as(pos[:, i]))[:, 2] > LEVEL
+        found.append(point[level & (point_speed(point, fps) < STAND_SPEED), 2])
+    heights = torch.cat(found).numpy() if found else np.zeros(0)
+    return heights[heights <= np.median(heights) + SAME_FLOOR_M] if len(heights) else heights
+
+
+def lowest_and_slow(point: Tensor, fps: float) -> Tensor:
+    """`(T)` bool, when a foot of unknown tilt stands: `point (T, 3)` m is among its lowest and slow."""
+    height = point[:, 2]
+    low = float(np.quantile(height.numpy(), LOWEST_SHARE))
+    return (height <= low + 1e-9) & (point_speed(point, fps) < STAND_SPEED)
+
+
+def bearing(ends: list[Tensor], fps: float) -> list[Tensor]:
+    """How much the ends `(T, 2, 3)` of each sole bear on z = 0 between frames: `(T - 1, 2)`, 0 to 1."""
+    if not ends:
+        return []
+    points = torch.cat(ends, 1)
+    step = torch.diff(points, dim=0) * fps
+    height = torch.maximum(points[1:, :, 2], points[:-1, :, 2])
+    near = ((CLEAR_M - height) / (CLEAR_M - BEARS_M)).clamp(0.0, 1.0)
+    # The faster a point is, the less it is a standing foot that slips (Tukey's biweight).
+    slow = (1.0 - (step[..., :2].norm(dim=-1) / SWING_SPEED).clamp(max=1.0).square()).square()
+    bears = near * slow * (step[..., 2].abs() <= CONTACT_RISE)
+    # A sole that rocks or bounces for a moment has not left.
+    reach = max(1, round(REST_GAP_S * fps / 2))
+    wide = functional.max_pool1d(bears.T[None], 2 * reach + 1, 1, reach)
+    closed = -functional.max_pool1d(-wide, 2 * reach + 1, 1, reach)[0].T
+    return [*torch.maximum(bears, closed * slow * near).split(2, -1)]
+
+
+def dragged(sole: Sole, weight: Tensor, fps: float) -> Tensor:
+    """Steps `(T - 1)` of spells in which the foot travels over the floor."""
+    step = torch.diff(sole.ends[..., :2], dim=0)
+    speed = torch.where(weight > 0, step.norm(dim=-1), torch.inf)
+    # The end that rests, if one does.
+    path = step.gather(1, speed.argmin(-1)[:, None, None].expand(-1, 1, 2))[:, 0]
+    out = torch.zeros(len(weight), dtype=torch.bool)
+    for first, last in find_runs(weight.amax(-1).numpy() > 0, 0):
+        way = torch.cumsum(path[first : last + 1], 0)
+        travel = float((way.amax(0) - way.amin(0)).norm())
+        seconds = (last - first + 1) / fps
+        out[first : last + 1] = travel > DRAG_M and travel / seconds > DRAG_SPEED
+    return out
+
+
+#: Frames of standing from which something is known.
+ENOUGH = 3
+
+
+def stands_higher(made: Clip, source: Clip, feet: Sequence[int]) -> float | None:
+    """By how much (m) the joints `feet` are higher in `made` while they stand in both motions, the
+    median; None where they hardly ever do."""
+    frames = min(made.frames, source.frames)
+    here, there = (torch.tensor(c.positions()[:frames][:, list(feet)]) for c in (made, source))
+    apart: list[float] = []
+    for k in range(len(feet)):
+        stands = lowest_and_slow(there[:, k], source.fps)
+        stands &= point_speed(here[:, k], made.fps) < STAND_SPEED
+        apart += (here[:, k] - there[:, k])[stands, 2].tolist()
+    return float(torch.tensor(apart).median()) if len(apart) >= ENOUGH else None
+
+
+#: Frames of standing of which the mean is to be trusted.
+ENOUGH_FRAMES = 5
+#: Degrees: less is no fault, and more is no foot that stands.
+LEAST_DEG, MOST_DEG = 1.0, 35.0
+
+
+@dataclass(frozen=True, eq=False)
+class Levelled:
+    """Turns of feet, constant over a clip: joint index to quaternion wxyz in the foot's own frame."""
+
+    turns: Mapping[int, Tensor]
+
+    def onto(self, clip: Clip) -> Clip:
+        """The clip with its feet turned; what hangs on them stays as it is in the world."""
+        return self._turned(clip, self.turns)
+
+    def off(self, clip: Clip) -> Clip:
+        """What `onto` did, undone."""
+        return self._turned(clip, {j: quat_conj(q) for j, q in self.turns.items()})
+
+    @staticmethod
+    def _turned(clip: Clip, turns: Mapping[int, Tensor]) -> Clip:
+        if not turns:
+            return clip
+        rot = torch.tensor(clip.rot)
+        for joint, turn in turns.items():
+            rot[:, joint] = quat_mul(rot[:, joint], turn)
+            for child in clip.skeleton.children(joint):
+                rot[:, child] = quat_between(turn, rot[:, child])
+        return clip.replaced(rot=rot.numpy())
+
+
+def level_feet(clip: Clip, table: BodyTable) -> Levelled:
+    """The turns with which the table's soles are level on average while the feet of a clip stand.
+
+    A foot stands while it is among the lowest and slow (`lowest_and_slow`). The turn is the shortest
+    from the sole's normal to the mean of the vertical, both in the foot's frame.
+    """
+    pos, quat = (torch.tensor(x) for x in clip.world())
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype)
+    turns: dict[int, Tensor] = {}
+    for _, row, box in sole_boxes(table):
+        normal = quat_rotate(torch.tensor(box.quat, dtype=pos.dtype), up)
+        place = carried(pos[:, row.joint], quat[:, row.joint], box.pos)
+        stands = lowest_and_slow(place, clip.fps)
+        if int(stands.sum()) < ENOUGH_FRAMES:
+            continue
+        here = quat[stands, row.joint]
+        mean = quat_rotate(quat_conj(here), up.expand(len(here), 3)).mean(0)
+        mean = mean / mean.norm()
+        angle = float(torch.rad2deg(torch.acos((normal @ mean).clamp(-1.0, 1.0))))
+        if LEAST_DEG < angle < MOST_DEG:
+            turns[row.joint] = shortest_arc(normal, mean)
+    return Levelled(turns)

@@ -1,0 +1,488 @@
+"""Feet held in place where they stand: one mechanism for every motion, and the path after them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.kinematics.feet import Sole, bearing, dragged, soles_of
+from poise.kinematics.forward import lowest_height
+from poise.kinematics.limbs import limb_of, match_positions
+from poise.kinematics.repair.faults import Fault
+from poise.kinematics.repair.support import Support, foot_slips
+from poise.motion import Clip, Skeleton
+from poise.motion.rotations import (
+    axis_angle_to_quat,
+    forward_kinematics,
+    quat_between,
+    quat_distance,
+    quat_mul,
+)
+from poise.motion.smoothing import find_runs, gaussian, smooth_lift
+
+#: A (s) and B (1/s) of the module's text.
+SMOOTH_S, RETURN_PER_S = 0.006, 0.6
+#: See `limbs.soft_reach`: feet that stand are kept in place by legs that may be nearly straight.
+_SOFT = 0.003
+#: Weight of a frame that must stay as it is; what is left of its correction is set to zero.
+_PINNED = 1e8
+
+
+class Lead(NamedTuple):
+    """What is done to a foot: shift `(T, 3)` m of its ankle, turn `(T)` rad about the vertical, tilt
+    `(T)` rad that raises its toe, about `axis (T, 3)`, which is level, and roll `(T)` rad about the line
+    of the sole, None without any."""
+
+    shift: Tensor
+    turn: Tensor
+    tilt: Tensor
+    axis: Tensor
+    roll: Tensor | None = None
+
+
+def lead(
+    sole: Sole,
+    weight: np.ndarray,
+    fps: float,
+    fixed: np.ndarray | None = None,
+    vertical: float = 0.0,
+    flat: np.ndarray | None = None,
+) -> Lead:
+    """How a foot must be led; see the module's text.
+
+    Args:
+        weight: `(T - 1, 2)`, how much each end bears between frames.
+        fixed: `(T)` bool, frames that stay as they are.
+        vertical: the heights of the ends are held as well, by a shift and a tilt, with this share of
+            `weight`.
+        flat: `(T - 1)`, how much the ankle stays as well, above the sole, by a roll of the foot.
+    """
+    fixed = np.zeros(len(sole.ankle), dtype=bool) if fixed is None else fixed
+    ends, ankle = sole.ends.numpy(), sole.ankle.numpy()
+    velocity = np.diff(ends, axis=0) * fps
+    length = float(np.linalg.norm(ends[0, 1] - ends[0, 0]))
+    arm = (ends - ankle[:, None]) / length
+    middle = 0.5 * (arm[1:] + arm[:-1])
+    way = ends[:, 1, :2] - ends[:, 0, :2]
+    way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+    # Unknowns per frame: s_x, s_y, L psi, and the roll about the sole's line times L.
+    rows, width = [], 3 if flat is None else 4
+    for p in range(2):
+        for axis, across in ((0, -middle[:, p, 1]), (1, middle[:, p, 0])):
+            unit = np.zeros((len(velocity), 4))
+            unit[:, axis], unit[:, 2] = 1.0, across
+            unit[:, 3] = middle[:, p, 2] * (way[1:, 1], -way[1:, 0])[axis]
+            unit = unit[:, :width]
+            rows.append((np.stack((-unit, unit), 1) * fps, -velocity[:, p, axis], weight[:, p]))
+    if flat is not None:
+        slip = np.diff(ankle, axis=0) * fps
+        for axis in range(2):
+            unit = np.tile(np.eye(width)[axis], (len(slip), 1))
+            rows.append((np.stack((-unit, unit), 1) * fps, -slip[:, axis], flat))
+    level = _solve(rows, width, fixed, fps)
+    up = np.zeros((len(ankle), 2))
+    if vertical:
+        # Unknowns per frame: s_z, L theta.
+        along = (middle[..., :2] * 0.5 * (way[1:] + way[:-1])[:, None]).sum(-1)
+        heights = []
+        for p in range(2):
+            unit = np.stack((np.ones(len(along)), along[:, p]), -1)
+            held = vertical * weight[:, p]
+            heights.append((np.stack((-unit, unit), 1) * fps, -velocity[:, p, 2], held))
+        up = _solve(heights, 2, fixed, fps)
+    shift = np.concatenate((level[:, :2], up[:, :1]), -1)
+    axis = np.stack((way[:, 1], -way[:, 0], np.zeros(len(way))), -1)
+    turns = (level[:, 2] / length, up[:, 1] / length, axis, *(level[:, 3:] / length).T)
+    return Lead(*(torch.tensor(x) for x in (shift, *turns)))
+
+
+def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]) -> Tensor:
+    """The motion `(T, J, 4)` with the feet (by joint) led, their legs bent to follow, all else kept."""
+    pos, quat = forward_kinematics(
+        skeleton.parents, torch.tensor(skeleton.offsets, dtype=rot.dtype), root, rot
+    )
+    goals: dict[int | str, Tensor] = {j: pos[:, j] + one.shift for j, one in leads.items()}
+    touched = torch.zeros(len(rot), dtype=torch.bool)
+    for one in leads.values():
+        touched |= one.shift.any(-1) | (one.turn != 0) | (one.tilt != 0)
+        if one.roll is not None:
+            touched |= one.roll != 0
+    out = match_positions(skeleton, rot, root, goals, soft=_SOFT)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=rot.dtype)
+    for joint, one in leads.items():
+        # The foot keeps its turn in the world, so its own turn is that of the world seen from it.
+        own = quat[:, joint]
+        tilt = axis_angle_to_quat(one.axis.to(own.dtype), one.tilt)
+        about = quat_mul(axis_angle_to_quat(up, one.turn), tilt)
+        if one.roll is not None:
+            line = torch.linalg.cross(up.expand_as(one.axis), one.axis.to(own.dtype), dim=-1)
+            about = quat_mul(about, axis_angle_to_quat(line, one.roll))
+        out[:, joint] = quat_mul(out[:, joint], quat_between(own, quat_mul(about, own)))
+    kept = torch.ones(rot.shape[:2], dtype=torch.bool)
+    for joint in leads:
+        kept[:, list(limb_of(skeleton, joint))] = ~touched[:, None]
+    return torch.where(kept[..., None], rot, out)
+
+
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _solve(rows: list[Rows], width: int, fixed: np.ndarray, fps: float) -> np.ndarray:
+    """`(T, width)` of least squares with the smoothing terms, zero in the frames `fixed`.
+
+    rows: blocks of `(R, m, width)` coefficients at the frames r to r + m - 1 of row r, what each row
+    should give, and its weight.
+    """
+    frames = len(fixed)
+    band, rhs = np.zeros((3 * width, width * frames)), np.zeros(width * frames)
+    for block in rows:
+        _add(band, rhs, *block)
+    for unit in np.eye(width):
+        if frames > 2:
+            bend = np.tile(np.stack((unit, -2 * unit, unit)) * fps**2, (frames - 2, 1, 1))
+            _add(band, rhs, bend, np.zeros(frames - 2), np.full(frames - 2, SMOOTH_S**2))
+        back = np.where(fixed, _PINNED, RETURN_PER_S**2)
+        _add(band, rhs, np.tile(unit, (frames, 1, 1)), np.zeros(frames), back)
+    from scipy.linalg import solveh_banded
+
+    x = solveh_banded(band, rhs, lower=True).reshape(frames, width)
+    x[fixed] = 0.0
+    return x
+
+
+def _add(
+    band: np.ndarray, rhs: np.ndarray, rows: np.ndarray, want: np.ndarray, weight: np.ndarray
+) -> None:
+    """Adds `weight |rows x - want|^2` to the normal equations in lower banded form."""
+    count, m, width = rows.shape
+    flat = rows.reshape(count, width * m)
+    at = width * np.arange(count)
+    for i in range(width * m):
+        np.add.at(rhs, at + i, weight * flat[:, i] * want)
+        for j in range(i + 1):
+            np.add.at(band[i - j], at + j, weight * flat[:, i] * flat[:, j])
+
+
+#: How often it is done: a leg that is led back moves its foot a little.
+HOLD_ROUNDS = 2
+#: How much a foot bears that stands for certain, see `Standing`.
+FIRM = 100.0
+#: rad/s of a leg's joint above which a foot is rather not held.
+FASTEST = 25.0
+#: Half the time (s) over which a lift out of the floor is spread.
+LIFT_S = 0.05
+
+
+class Standing(NamedTuple):
+    """How a foot stands.
+
+    sole: its points.
+    weight: `(T - 1, 2)`, how much either end of the sole bears between frames; from 0 to 1 it may drift
+        by millimetres per second, larger numbers hold it firmly.
+    lift: `(T)` m, how much higher it must be, None where it stays.
+    flat: `(T - 1)`, how much its ankle bears as well, so that it does not roll; None where it may.
+    """
+
+    sole: Sole
+    weight: Tensor
+    lift: Tensor | None = None
+    flat: Tensor | None = None
+
+
+def hold(
+    skeleton: Skeleton,
+    root: Tensor,
+    rot: Tensor,
+    fps: float,
+    standing: Callable[[Tensor, Tensor], Mapping[int, Standing]],
+    fixed: Tensor | None = None,
+    vertical: float = 0.0,
+    rounds: int = HOLD_ROUNDS,
+) -> Tensor:
+    """Rotations `(T, J, 4)` wxyz with the feet held where they stand; all but the legs stays as it is.
+
+    Args:
+        root: `(T, 3)` m. rot: `(T, J, 4)` wxyz, local.
+        standing: tells from world poses `(T, J, 3)` m and `(T, J, 4)` how feet stand, by their joint.
+        fixed: `(T)` bool, frames that stay as they are.
+        vertical: the heights of the soles' ends are held as well, with this share of their weight.
+    """
+    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
+    pinned = None if fixed is None else fixed.numpy()
+    for _ in range(rounds):
+        leads = {}
+        for foot, one in standing(*forward_kinematics(skeleton.parents, offsets, root, rot)).items():
+            flat = None if one.flat is None else one.flat.numpy()
+            leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical, flat)
+            if one.lift is not None:
+                leads[foot].shift[:, 2] += one.lift
+        rot = led(skeleton, rot, root, leads) if leads else rot
+    return rot
+
+
+@dataclass(frozen=True)
+class Held:
+    """What holding moved: mm that an ankle was led away from its path, on average over frames in which a
+    foot bears and at most; and the feet that were left as they were."""
+
+    mean_mm: float
+    max_mm: float
+    left: tuple[str, ...] = ()
+
+
+def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
+    """The clip with its standing feet held, and what that took; all but the legs stays as it is.
+
+    A foot bears where an end of its sole is near the floor and neither rises nor swings (`bearing`).
+    Feet that are dragged on purpose are left alone. Soles under the floor are lifted out of it, too. A
+    foot is left as it is where its leg would turn faster than joints do, and did not before.
+
+    Args:
+        table: the body with the soles; feet without a box have no sole. The floor is at z = 0.
+    """
+    if clip.frames < 3:
+        return clip, Held(0.0, 0.0)
+    rows, bears, left = [r.joint for r in table.rows], dict[int, np.ndarray](), set[int]()
+
+    def standing(pos: Tensor, quat: Tensor) -> dict[int, Standing]:
+        pos, quat = pos[:, rows], quat[:, rows]
+        soles, low, out = soles_of(table, pos, quat), lowest_height(table, pos, quat), {}
+        weights = bearing([sole.ends for sole in soles.values()], clip.fps)
+        for (row, sole), weight in zip(soles.items(), weights, strict=True):
+            if rows[row] in left:
+                continue
+            weight = weight * ~dragged(sole, weight, clip.fps)[:, None]
+            deep = (-low[:, row]).clamp_min(0.0).numpy()
+            lift = torch.tensor(smooth_lift(deep, clip.fps, LIFT_S)) if deep.any() else None
+            out[rows[row]] = Standing(sole, weight, lift)
+            steps = (weight.amax(-1) > 0).numpy()
+            bears[rows[row]] = np.append(steps, steps[-1])
+        return out
+
+    root, rot = clip.tensors()
+    out = hold(clip.skeleton, root, rot, clip.fps, standing)
+    while fast := _too_fast(clip.skeleton, rot, out, clip.fps, bears):
+        left |= fast
+        bears.clear()
+        out = hold(clip.skeleton, root, rot, clip.fps, standing)
+    held = clip.replaced(rot=out.numpy()) if bears else clip
+    moved = np.linalg.norm(held.positions() - clip.positions(), axis=-1) * 1000
+    borne = np.concatenate([moved[when, foot] for foot, when in bears.items()] or [np.zeros(0)])
+    most = max((float(moved[:, foot].max()) for foot in bears), default=0.0)
+    names = tuple(clip.skeleton.names[foot] for foot in sorted(left))
+    return held, Held(float(borne.mean()) if len(borne) else 0.0, most, names)
+
+
+def _too_fast(
+    skeleton: Skeleton, before: Tensor, after: Tensor, fps: float, feet: Iterable[int]
+) -> set[int]:
+    """Feet with a leg of which a joint turns faster than joints do since it is led."""
+    moved = (before != after).flatten(2).any(-1).any(0)
+    fastest = [fps * quat_distance(x[:-1], x[1:]).amax(0) for x in (before, after)]
+    out = set[int]()
+    for foot in feet:
+        leg = [j for j in (foot, *skeleton.ancestors(foot)) if moved[j]]
+        was, now = (max((float(x[j]) for j in leg), default=0.0) for x in fastest)
+        if now > max(FASTEST, was):
+            out.add(foot)
+    return out
+
+
+#: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
+#: (m/s) that a rolling sole has anyway and that is left.
+COMMON_S, ROLL_SPEED = 0.4, 0.04
+#: The path drifts only where soles lie flat for so long (s) and slip with no more than this share of
+#: unsteadiness, each foot for this time (s) in all, and one foot tells this share of the other's slips.
+FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
+
+
+def drifts(support: Support) -> bool:
+    """Whether the path itself drifts: what slips is one motion of the floor, the same for both feet.
+
+    A foot tells where its whole sole is down for `FLAT_S` and slips steadily; one that rolls, pivots or
+    trembles does not. From the slips of either foot those of the other must follow, so that at least
+    `EXPLAINED` of their energy goes.
+    """
+    contact = support.contacts[1].numpy()
+    velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
+    told = []
+    for foot in dict.fromkeys(support.feet):
+        mine = np.flatnonzero(np.array(support.feet) == foot)
+        slip, weight = velocity[:, mine].mean(1), np.zeros(len(velocity))
+        turning = np.linalg.norm(velocity[:, mine] - slip[:, None], axis=-1).max(1)
+        for first, last in find_runs(np.all(contact[:, mine], axis=-1), 0):
+            run = slice(first, last + 1)
+            mean = slip[run].mean(0)
+            off = np.linalg.norm(slip[run] - mean, axis=-1) + turning[run]
+            size = float(np.linalg.norm(mean))
+            if last - first + 1 >= FLAT_S * support.fps and np.sqrt(np.mean(off**2)) <= STEADY * size:
+                weight[run] = 1.0
+        told.append((slip, weight))
+    if len(told) != 2 or min(weight.sum() for _, weight in told) < TOLD_S * support.fps:
+        return False
+    for (slip, weight), (other, here) in (told, told[::-1]):
+        guess, near = _mean_near(other, here, support.fps)
+        both = (weight > 0) & (near > 0)
+        energy = float((slip[both] ** 2).sum())
+        left = float(((slip[both] - guess[both]) ** 2).sum())
+        if energy < ROLL_SPEED**2 * both.sum() or left > (1 - EXPLAINED) * energy or not both.any():
+            return False
+    return True
+
+
+def _mean_near(slip: np.ndarray, weight: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """The mean `(T, 2)` of `slip (T, 2)` by `weight (T)` around every frame, and the weight there."""
+    kernel = gaussian(COMMON_S * fps)
+    parts = [np.pad(x, len(kernel) // 2) for x in (weight, slip[:, 0] * weight, slip[:, 1] * weight)]
+    total, *mean = (np.convolve(x, kernel, "valid") for x in parts)
+    return np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None], total
+
+
+def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
+    """The clip with its root path freed of the slip that all standing feet have in common.
+
+    The mean slip of the planted sole points, averaged over time, is taken off the root's horizontal
+    velocity wherever feet were found to slide; slower slips than `ROLL_SPEED` stay.
+    """
+    feet = foot_slips(support)
+    # How many feet stand, and the mean of their slips (m/s).
+    weight = np.sum([contact for _, _, contact in feet], axis=0).astype(float)
+    slip = np.sum([slip for _, slip, _ in feet], axis=0) / np.maximum(weight, 1.0)[:, None]
+    if not weight.any() or not faults:
+        return clip
+    mean = _mean_near(slip, weight, clip.fps)[0]
+    size = np.linalg.norm(mean, axis=-1, keepdims=True)
+    mean = mean * np.maximum(1.0 - ROLL_SPEED / np.maximum(size, 1e-9), 0.0)
+    near = np.zeros(clip.frames - 1)
+    for fault in faults:
+        near[max(fault.start - 1, 0) : fault.stop + 1] = 1.0
+    # The correction fades out over the averaging time beside the spells that slide.
+    reach = max(1, round(COMMON_S * clip.fps))
+    # Takes 0.2 s to load, which `poise info` need not wait for.
+    from scipy.ndimage import maximum_filter1d
+
+    hull = maximum_filter1d(near, 2 * reach + 1, mode="constant")
+    window = gaussian(0.3 * COMMON_S * clip.fps)
+    hull = np.convolve(np.pad(hull, len(window) // 2, mode="edge"), window, "valid")
+    path = np.array(clip.root_pos)
+    path[1:, :2] -= np.cumsum(mean * hull[:, None], axis=0) / clip.fps
+    return clip.replaced(root_pos=path)
+
+
+def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
+    """The clip with every sliding foot held in place while it stands, its leg bent to follow (`hold`).
+
+    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`.
+    """
+    contact, weights = support.contacts[1], {}
+    for foot in dict.fromkeys(support.feet):
+        mine = [k for k, joint in enumerate(support.feet) if joint == foot]
+        slides = torch.zeros(clip.frames - 1, 1, dtype=torch.bool)
+        for fault in faults:
+            if fault.joint == clip.skeleton.names[foot]:
+                slides[fault.start : fault.stop] = True
+        if bool(slides.any()):
+            weights[foot] = mine, (contact[:, mine] & slides).double() * FIRM
+
+    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
+        return {
+            foot: Standing(Sole(pos[:, foot], support.soles[:, mine]), weight)
+            for foot, (mine, weight) in weights.items()
+        }
+
+    root, rot = clip.tensors()
+    out = hold(clip.skeleton, root, rot, clip.fps, standing, rounds=1)
+    return clip.replaced(rot=out.numpy())
+
+
+#: What an end of a sole does that stands (deviations): m/s level, by axis, and of its rise; m of height.
+LEVEL_SPEED, RISE_SPEED, HEIGHT_M = 0.05, 0.06, 0.012
+#: The same of one that swings, at least; and so many times that of one that stands.
+SWING = (1.0, 0.5, 0.12)
+WIDER = 3.0
+#: How long (s) noise lasts, so that frames in it tell one thing, and a foot stands or swings.
+ALIKE_S, LASTS_S = 0.1, 0.4
+#: How often both are told, and how surely an end stands that bears: the power of its probability.
+TOLD_ROUNDS, SURE = 4, 3
+#: See the module's text: how much an end bears, at most, and how that grows.
+BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
+
+
+def steadied(clip: Clip, support: Support) -> Clip:
+    """The clip with its feet held while they stand; see the module's text."""
+    stands, level, rise = stance(support)
+    firm, upright = (_firm(s / q) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
+    weight = torch.tensor(firm * stands**SURE)
+    if firm <= 0.0 or not bool(weight.any()):
+        return clip
+
+    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
+        out = dict[int, Standing]()
+        for foot in dict.fromkeys(support.feet):
+            mine = [k for k, joint in enumerate(support.feet) if joint == foot]
+            sole, own = Sole(pos[:, foot], support.soles[:, mine]), weight[:, mine]
+            out[foot] = Standing(sole, own, flat=own.amin(-1))
+        return out
+
+    root, rot = clip.tensors()
+    out = hold(clip.skeleton, root, rot, clip.fps, standing, vertical=upright / firm, rounds=1)
+    return clip.replaced(rot=out.numpy())
+
+
+def stance(support: Support) -> tuple[np.ndarray, float, float]:
+    """How likely each end of a sole stands between frames `(T - 1, F)`, and the deviations of its level
+    speed (by axis) and of its rise while it does, m/s. Contacts that a file states stay."""
+    soles, fps = support.soles.numpy(), support.fps
+    velocity = np.diff(soles, axis=0) * fps
+    height = np.maximum(soles[1:, :, 2], soles[:-1, :, 2]) + support.fit.lift_m
+    stands, level, rise = support.contacts[1].numpy().astype(float), 0.0, 0.0
+    if support.labels is None:
+        # Where all that is near the floor is fast, a foot swings through; skating is no tremble.
+        stands *= support.contacts[0].numpy() <= SWING[0]
+    for _ in range(TOLD_ROUNDS):
+        total = stands.sum()
+        if total < 1.0:
+            break
+        floor = (stands * height).sum() / total
+        # Lower than the floor is on it.
+        parts = (velocity[..., :2], velocity[..., 2:], np.maximum(height - floor, 0.0)[..., None])
+        ratio, sizes = np.zeros_like(height), list[float]()
+        for y, own, least in zip(parts, (LEVEL_SPEED, RISE_SPEED, HEIGHT_M), SWING, strict=True):
+            square, count = (y**2).sum(-1), y.shape[-1]
+            spread = square if y is not parts[2] else (height - floor) ** 2
+            size = float(np.sqrt((stands * spread).sum() / (count * total) + own**2))
+            wide = max(least, WIDER * size)
+            ratio += count * np.log(wide / size) - 0.5 * square * (size**-2 - wide**-2)
+            sizes.append(size)
+        level, rise = sizes[:2]
+        if support.labels is not None:
+            break
+        stands = _joined(ratio / max(ALIKE_S * fps, 1.0), min(0.5, 1.0 / (LASTS_S * fps)))
+    return stands, level, rise
+
+
+def _firm(share: float) -> float:
+    """How much an end bears that is so many times as fast as those without noise are."""
+    return min(MOST, BEARS * max(share**2 - 1.0, 0.0) ** STEEP)
+
+
+def _joined(ratio: np.ndarray, change: float) -> np.ndarray:
+    """Probabilities `(T, F)` of the first of two states from their log ratios `(T, F)`, by the forward
+    and the backward pass of a chain that changes state with the probability `change` at every step."""
+
+    def passed(x: np.ndarray) -> np.ndarray:
+        out, before = np.empty_like(x), np.zeros(x.shape[1])
+        for t in range(len(x)):
+            share = change + (1.0 - 2.0 * change) / (1.0 + np.exp(-np.clip(before, -40.0, 40.0)))
+            out[t] = np.log(share / (1.0 - share))
+            before = out[t] + x[t]
+        return out
+
+    both = passed(ratio) + passed(ratio[::-1])[::-1] + ratio
+    return 1.0 / (1.0 + np.exp(-np.clip(both, -40.0, 40.0)))

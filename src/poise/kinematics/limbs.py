@@ -1,0 +1,279 @@
+"""Arms and legs put where they should be: two bones solved in closed form, many frames at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import find_anatomy
+from poise.errors import PoiseError
+from poise.motion import Skeleton
+from poise.motion.rotations import (
+    across,
+    axis_angle_to_quat,
+    forward_kinematics,
+    normalize,
+    quat_between,
+    quat_mul,
+    quat_rotate,
+    quat_rotate_inv,
+    shortest_arc,
+)
+from poise.motion.smoothing import find_runs
+
+#: The share of a limb's length over which it slows down before it is straight.
+SOFT = 0.02
+#: Sine of a bend below which the limb's usual bend plane takes over from the one of the moment.
+STRAIGHT = 0.1
+#: Sine of a bend from which on the side to which a limb bends is told.
+BENT = 0.02
+#: Sine of a bend beyond straight from which on a limb is not stretched but bends that way.
+BACKWARDS = 0.25
+_LIMBS = {"foot": ("thigh", "shin"), "hand": ("upper_arm", "forearm")}
+
+
+class TwoBone(NamedTuple):
+    """mid, end: `(..., 3)` m, world. normal: `(..., 3)`, the unit axis about which the limb bends."""
+
+    mid: Tensor
+    end: Tensor
+    normal: Tensor
+
+
+class Limb(NamedTuple):
+    """The joints of one limb: where it starts (hip), bends (knee) and ends (ankle)."""
+
+    root: int
+    mid: int
+    end: int
+
+
+def two_bone(
+    root: Tensor,
+    target: Tensor,
+    pole: Tensor,
+    l1: Tensor | float,
+    l2: Tensor | float,
+    soft: float = SOFT,
+) -> TwoBone:
+    """A limb of bones `l1`, `l2` (m) from `root` towards `target`, bent to the side of `pole`.
+
+    Args:
+        root, target: `(..., 3)` m. pole: `(..., 3)`, a direction; only its part across the line from
+            root to target counts (an axis across it is taken where nothing remains).
+        soft: see `soft_reach`. A target out of reach is approached along the line to it.
+
+    The law of cosines gives the place of the knee along that line:
+    a = (l1^2 - l2^2 + d^2) / (2 d), h = sqrt(l1^2 - a^2).
+    """
+    l1, l2 = (torch.as_tensor(x, dtype=root.dtype) for x in (l1, l2))
+    line = target - root
+    along = _direction(line)
+    d = soft_reach(line.norm(dim=-1), l1, l2, soft)
+    side = pole - (pole * along).sum(-1, keepdim=True) * along
+    lost = side.norm(dim=-1, keepdim=True) < 1e-9 * (1.0 + pole.norm(dim=-1, keepdim=True))
+    side = normalize(torch.where(lost, across(along), side))
+    a = (l1.square() - l2.square() + d.square()) / (2.0 * d.clamp_min(1e-9))
+    a = torch.minimum(torch.maximum(a, -l1), l1)
+    h = (l1.square() - a.square()).clamp_min(0.0).sqrt()
+    mid = root + a.unsqueeze(-1) * along + h.unsqueeze(-1) * side
+    # The end turns from the side towards the line: upper bone x lower bone points along side x along.
+    return TwoBone(mid, root + d.unsqueeze(-1) * along, torch.linalg.cross(side, along))
+
+
+def soft_reach(distance: Tensor, l1: Tensor, l2: Tensor, soft: float = SOFT) -> Tensor:
+    """The distance `(...)` m that a limb spans when it is asked for `distance`.
+
+    Up to L (1 - soft), with L = l1 + l2, it is the distance itself; beyond, it nears L exponentially, so
+    that a knee never snaps straight: d' = L - s exp(-(d - L + s) / s) with s = soft L. `soft` 0 clamps
+    at L. Never nearer than |l1 - l2|.
+    """
+    length = l1 + l2
+    s = (soft * length).clamp_min(1e-12)
+    eased = length - s * torch.exp(-((distance - length + s) / s).clamp_min(0.0))
+    return torch.maximum(torch.where(distance > length - s, eased, distance), (l1 - l2).abs())
+
+
+def limb_of(skeleton: Skeleton, joint: int | str) -> Limb:
+    """The joints that move a hand or foot: those of the anatomy, else the two bones above `joint`."""
+    end = skeleton.index(joint) if isinstance(joint, str) else joint
+    try:
+        parts = find_anatomy(skeleton).parts
+    except PoiseError:
+        parts = ()
+    part = next((p for p in parts if p.joint == end and p.kind in _LIMBS), None)
+    if part is not None:
+        root, mid = (
+            next(p.joint for p in parts if p.kind == kind and p.side == part.side)
+            for kind in _LIMBS[part.kind]
+        )
+        return Limb(root, mid, end)
+    chain, j = [end], end
+    while len(chain) < 3 and skeleton.parents[j] >= 0:
+        length = float(np.linalg.norm(skeleton.offsets[j]))
+        j = skeleton.parents[j]
+        # Joints at one place are one joint.
+        if length > 1e-4:
+            chain.append(j)
+    if len(chain) < 3:
+        raise PoiseError(
+            f"joint '{skeleton.names[end]}' has no two bones above it", skeleton.source.path
+        )
+    return Limb(chain[2], chain[1], chain[0])
+
+
+def match_positions(
+    skeleton: Skeleton,
+    rot: Tensor,
+    root_pos: Tensor,
+    targets: Mapping[int | str, Tensor],
+    limbs: Mapping[int | str, Limb] | None = None,
+    soft: float = SOFT,
+) -> Tensor:
+    """The motion with hands and feet on their targets and all else kept: new `rot (T, J, 4)` wxyz.
+
+    The knee or elbow is bent to the right length about its own axis, then the whole limb swings by the
+    smallest turn; hands and feet keep their world rotation. Where a limb is straight, its usual bend
+    plane over the clip holds, so that it does not flip. Targets equal to what is there change nothing.
+
+    Args:
+        rot: `(T, J, 4)` wxyz local. root_pos: `(T, 3)` m.
+        targets: `(T, 3)` m world of each joint, by index or name; a NaN row leaves its frame free.
+        limbs: which joints move a target, `limb_of` by default.
+        soft: see `soft_reach`; a limb that the motion itself holds straighter may stay so.
+    """
+    out = rot.clone()
+    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
+    for joint, goal in targets.items():
+        limb = (limbs or {}).get(joint) or limb_of(skeleton, joint)
+        pos, quat = forward_kinematics(skeleton.parents, offsets, root_pos, out)
+        goal = torch.as_tensor(goal, dtype=rot.dtype)
+        now = pos[:, limb.end]
+        goal = torch.where(goal.isfinite().all(-1, keepdim=True), goal, now)
+        hip, knee = pos[:, limb.root], pos[:, limb.mid]
+        bend, swing = _reach(hip, knee, now, goal, quat[:, limb.root], soft)
+        _turn(skeleton, out, quat, limb, bend, swing)
+    return normalize(out)
+
+
+def _reach(
+    root: Tensor, mid: Tensor, end: Tensor, goal: Tensor, upper_quat: Tensor, soft: float
+) -> tuple[Tensor, Tensor]:
+    """World turns (wxyz) of the lower bone about the knee, then of the whole limb about its root."""
+    u, v = root - mid, end - mid
+    l1, l2 = u.norm(dim=-1), v.norm(dim=-1)
+    now, want = (end - root).norm(dim=-1), (goal - root).norm(dim=-1)
+    # A limb that is straighter than the soft reach allows may stay as straight as it is.
+    span = torch.maximum(soft_reach(want, l1, l2, soft), torch.minimum(want, now))
+    axis, sine = _bend_axis(-u, v, upper_quat)
+    span = now + _through_straight(sine) * (span - now)
+    # |u - R v|^2 = d^2 gives A cos(delta) + B sin(delta) = (|u|^2 + |v|^2 - d^2) / 2 - C for R the turn
+    # by delta about the axis n: A = u_n . v_n (parts across n), B = u . (n x v), C = (u . n) (v . n).
+    c = (u * axis).sum(-1) * (v * axis).sum(-1)
+    a = (u * v).sum(-1) - c
+    b = (u * torch.linalg.cross(axis, v)).sum(-1)
+    size = torch.hypot(a, b).clamp_min(1e-12)
+    fold = torch.atan2(b, a)
+    open_by = torch.acos((((l1**2 + l2**2 - span**2) / 2 - c) / size).clamp(-1.0, 1.0))
+    # The limb is folded at delta = fold; it bends on the axis' positive side, except where it is
+    # stretched beyond straight and need not bend more than about that, or really bends that way.
+    flexion = math.pi - open_by
+    little = flexion < 1.5 * torch.asin((-sine).clamp(0.0, 1.0)) + 1e-9
+    over = torch.zeros_like(little)
+    for first, last in find_runs((sine < 0).numpy(), 0):
+        spell = slice(first, last + 1)
+        # One side for a whole spell: a knee that changed it within one would jump.
+        over[spell] = bool(little[spell].all()) or float(sine[spell].min()) < -BACKWARDS
+    delta = fold - torch.where(over, -open_by, open_by)
+    delta = torch.remainder(delta + math.pi, 2 * math.pi) - math.pi
+    # Nothing to do stays nothing to do, whatever rounding says about a straight limb.
+    delta = torch.where((span - now).abs() < 1e-12, torch.zeros_like(delta), delta)
+    bend = axis_angle_to_quat(axis, delta)
+    reached = quat_rotate(bend, v) - u
+    return bend, shortest_arc(reached, goal - root)
+
+
+def _through_straight(sine: Tensor) -> Tensor:
+    """`(T,)`, how much of a correction a limb gets that bends either way, by the sine of its bend.
+
+    One that really bends backwards passes through straight on its way. What shortens it there would
+    bend it to one side before and to the other after that, in a jump; so nothing does.
+    """
+    share = torch.ones_like(sine)
+    small = (sine.abs() / BACKWARDS).clamp(max=1.0)
+    for first, last in find_runs((sine < 0).numpy(), 0):
+        if float(sine[first : last + 1].min()) >= -BACKWARDS:
+            continue
+        while first > 0 and 0 <= float(sine[first - 1]) < BACKWARDS:
+            first -= 1
+        while last + 1 < len(sine) and 0 <= float(sine[last + 1]) < BACKWARDS:
+            last += 1
+        share[first : last + 1] = small[first : last + 1]
+    return share
+
+
+def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor, Tensor]:
+    """The unit axis `(T, 3)` about which a limb bends, and the signed sine of its bend about it.
+
+    Where it is nearly straight, the mean axis of the clip in the upper bone's own frame.
+    """
+    cross = torch.linalg.cross(normalize(upper), normalize(lower))
+    own = quat_rotate_inv(upper_quat, cross)
+    signed = _side(own).unsqueeze(-1) * own
+    usual = signed.sum(0)
+    if float(usual.norm()) < 1e-6 * len(own):
+        usual = across(quat_rotate_inv(upper_quat, upper)[0])
+    usual = normalize(usual).expand_as(own)
+    size = own.norm(dim=-1, keepdim=True)
+    # Full weight on the moment's own axis from 2 * STRAIGHT on.
+    share = ((size - STRAIGHT) / STRAIGHT).clamp(0.0, 1.0)
+    share = share * share * (3 - 2 * share)
+    mixed = share * signed / size.clamp_min(1e-12) + (1 - share) * usual
+    axis = normalize(torch.where(mixed.norm(dim=-1, keepdim=True) < 0.1, usual, mixed))
+    return quat_rotate(upper_quat, axis), (own * axis).sum(-1)
+
+
+def _side(own: Tensor) -> Tensor:
+    """`(T,)` 1 where a limb bends to its usual side, -1 where it is stretched beyond straight.
+
+    own: `(T, 3)`, the axis of its bend in the upper bone's frame, as long as the bend's sine. It turns
+    round as the limb passes through straight; where it turns without that, the side is the same.
+    """
+    bent = (own.norm(dim=-1) > BENT).nonzero().squeeze(-1)
+    if not len(bent):
+        return torch.ones(len(own), dtype=own.dtype)
+    same = (own[bent[1:]] * own[bent[:-1]]).sum(-1) >= 0
+    ones = torch.ones(1, dtype=own.dtype)
+    side = torch.cat((ones, torch.where(same, 1.0, -1.0).to(own))).cumprod(0)
+    if float((side * own[bent].square().sum(-1)).sum()) < 0:
+        side = -side
+    last = (torch.searchsorted(bent, torch.arange(len(own)), right=True) - 1).clamp_min(0)
+    return side[last]
+
+
+def _turn(
+    skeleton: Skeleton, rot: Tensor, quat: Tensor, limb: Limb, bend: Tensor, swing: Tensor
+) -> None:
+    """Writes the turns into the local rotations; the end keeps its world rotation `quat`."""
+    parents = skeleton.parents
+    both = quat_mul(swing, bend)
+
+    def above(j: int) -> Tensor:
+        one = torch.zeros_like(swing)
+        one[:, 0] = 1.0
+        return quat[:, parents[j]] if parents[j] >= 0 else one
+
+    rot[:, limb.root] = quat_between(above(limb.root), quat_mul(swing, quat[:, limb.root]))
+    rot[:, limb.mid] = quat_between(above(limb.mid), quat_mul(bend, quat[:, limb.mid]))
+    rot[:, limb.end] = quat_between(quat_mul(both, above(limb.end)), quat[:, limb.end])
+
+
+def _direction(v: Tensor) -> Tensor:
+    """`v (..., 3)` at unit length; a zero vector points down."""
+    down = torch.tensor([0.0, 0.0, -1.0], dtype=v.dtype)
+    return torch.where(v.norm(dim=-1, keepdim=True) < 1e-12, down, normalize(v))

@@ -1,0 +1,157 @@
+"""Contacts carried over to another body: planted feet and hands stay planted, nothing sinks deeper."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body.topology import subtree
+from poise.kinematics.feet import TOUCH_M, contact_labels
+from poise.kinematics.forward import carried
+from poise.kinematics.limbs import Limb, match_positions
+from poise.kinematics.retarget.passage import Passage
+from poise.kinematics.retarget.standing import World
+from poise.motion import Clip
+from poise.motion.roles import SIDES
+from poise.motion.rotations import forward_kinematics, quat_rotate
+from poise.motion.smoothing import smooth_lift
+
+#: Time (s) over which a foot goes from its own path to its contact and back.
+BLEND_S = 0.25
+#: Half the time (s) over which a lift is spread.
+LIFT_S = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """One end that may touch the floor, in source and target.
+
+    name: "left foot", ...; source, target: its joint in either. limb: the joints that move it in the
+    target. tread_source, tread_target: `(3)` m, in its frame, the point that is held.
+    """
+
+    name: str
+    source: int
+    target: int
+    limb: Limb
+    tread_source: Tensor
+    tread_target: Tensor
+
+    def points(self, pos: Tensor, quat: Tensor, target: bool) -> Tensor:
+        """`(T, 3)` m, where the held point is."""
+        joint, tread = (self.target, self.tread_target) if target else (self.source, self.tread_source)
+        return carried(pos[:, joint], quat[:, joint], tread)
+
+
+def feet_of(passage: Passage) -> tuple[Foot, ...]:
+    """Both feet, and the hands that both skeletons have."""
+    here, there = passage.here, passage.there
+    out = []
+    for kinds, label in (
+        (("thigh", "shin", "foot"), "foot"),
+        (("upper_arm", "forearm", "hand"), "hand"),
+    ):
+        for k, side in enumerate(SIDES):
+            pairs = [passage.joints.limb_pair(f"{side}_{kind}") for kind in kinds]
+            if any(p is None for p in pairs):
+                continue
+            chain = [p for p in pairs if p is not None]
+            bones = np.diff(there.pos[[p[1] for p in chain]], axis=0)
+            if np.linalg.norm(bones, axis=-1).min() < 1e-4:
+                # A bone of no length reaches nowhere.
+                continue
+            held = [torch.zeros(3, dtype=torch.float64)] * 2
+            if label == "foot":
+                held = [torch.tensor(here.treads[k]), torch.tensor(there.treads[k])]
+            limb = Limb(*(p[1] for p in chain))
+            out.append(Foot(f"{side} {label}", *chain[2], limb, held[0], held[1]))
+    return tuple(out)
+
+
+def source_contacts(clip: Clip, world: World, feet: tuple[Foot, ...], ground: float) -> Tensor:
+    """`(T, F)` bool, which end touches the ground in the source: as its file says, else low and slow."""
+    out, said = [], dict(clip.contacts)
+    for foot in feet:
+        if foot.source in said:
+            out.append(torch.tensor(said[foot.source].any(1)))
+            continue
+        tread = foot.points(*world, target=False)[:, None]
+        low = TOUCH_M[foot.name.split()[1]]
+        out.append(contact_labels(tread, clip.fps, low, ground=ground)[:, 0])
+    return torch.stack(out, 1)
+
+
+def plant(
+    clip: Clip,
+    world: World,
+    passage: Passage,
+    rot: Tensor,
+    root: Tensor,
+    feet: tuple[Foot, ...],
+    contacts: Tensor,
+    hold: bool,
+    clear: bool,
+) -> tuple[Tensor, Tensor]:
+    """New local rotations `(T, J, 4)` and root path `(T, 3)` of the target with its contacts kept.
+
+    While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
+    after scaling: what stood still stands still. Limbs that would then be under the floor by more than
+    in the source are lifted; where trunk, knees or elbows are, or a limb does not reach, the whole body
+    is. The limbs are solved by two bones in closed form; feet and hands keep their turn.
+    """
+    skeleton, scale = passage.joints.target.skeleton, passage.scale
+    offsets = torch.tensor(skeleton.offsets)
+    depth = passage.here.depth(world, scale.ground) * scale.factor
+
+    def lift(pos: Tensor, quat: Tensor, parts: Collection[int]) -> Tensor:
+        """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
+        excess = passage.there.depth(World(pos, quat), scale.ground, parts) - depth
+        if float(excess.max()) < 1e-6:
+            return torch.zeros(len(pos), dtype=pos.dtype)
+        return torch.tensor(smooth_lift(excess.clamp_min(0.0).numpy(), clip.fps, LIFT_S, clip.cyclic))
+
+    if clear:
+        ends = {j for foot in feet for j in subtree(skeleton, foot.target)}
+        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        up = torch.zeros_like(root)
+        up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
+        root = root + up
+    pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+    goals: dict[int | str, Tensor] = {}
+    for k, foot in enumerate(feet):
+        goal = pos[:, foot.target]
+        if hold:
+            arm = quat_rotate(quat[:, foot.target], foot.tread_target.expand(len(pos), 3))
+            wanted = scale.place(foot.points(*world, target=False)) - arm
+            goal = goal + contact_weight(contacts[:, k], clip.fps)[:, None] * (wanted - goal)
+        if clear:
+            moved = pos + (goal - pos[:, foot.target])[:, None]
+            up = torch.zeros_like(goal)
+            up[:, 2] = lift(moved, quat, subtree(skeleton, foot.target))
+            goal = goal + up
+        goals[foot.target] = goal
+    by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
+    rot = match_positions(skeleton, rot, root, goals, by_end)
+    if clear:
+        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        up = torch.zeros_like(root)
+        up[:, 2] = lift(pos, quat, range(len(skeleton)))
+        root = root + up
+    return rot, root
+
+
+def contact_weight(contact: Tensor, fps: float) -> Tensor:
+    """`(T)` in [0, 1]: 1 where `contact (T)` holds, falling to 0 over `BLEND_S` around it."""
+    if not bool(contact.any()):
+        return torch.zeros(len(contact), dtype=torch.float64)
+    frames = torch.arange(len(contact))
+    at = frames[contact]
+    k = torch.searchsorted(at, frames)
+    after = at[k.clamp(max=len(at) - 1)]
+    before = at[(k - 1).clamp(min=0)]
+    away = torch.minimum((after - frames).abs(), (frames - before).abs()).double() / fps
+    return 0.5 + 0.5 * torch.cos(torch.pi * (away / BLEND_S).clamp(max=1.0))

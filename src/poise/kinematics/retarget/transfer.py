@@ -1,0 +1,197 @@
+"""A motion on another skeleton: the same directions of all bones, the same steps, at its own size."""
+
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.body.topology import subtree
+from poise.kinematics.retarget.common_pose import common_pose
+from poise.kinematics.retarget.passage import Passage
+from poise.kinematics.retarget.plant import feet_of, plant, source_contacts
+from poise.kinematics.retarget.retarget_report import RetargetReport, measure
+from poise.kinematics.retarget.standing import World
+from poise.motion import Clip, Roles, Skeleton
+from poise.motion.roles import SIDES, find_roles
+from poise.motion.rotations import (
+    axis_angle_to_quat,
+    normalize,
+    quat_between,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    shortest_arc,
+    unwrap_quats,
+)
+
+
+@dataclass(frozen=True)
+class RetargetConfig:
+    """How a motion passes to another skeleton.
+
+    contacts: hold planted feet and hands where the source's are, scaled. clear: lift what would sink
+    deeper into the floor than in the source. scale: size of the path, by default the ratio of the
+    heights of the hips. share: where the target's spine has more joints than the source's, they share
+    its bend out; without, those that lie on a bone of the source move as that bone. rigid: roles that
+    keep to what carries them.
+    """
+
+    contacts: bool = True
+    clear: bool = True
+    scale: float | None = None
+    share: bool = True
+    rigid: tuple[str, ...] = ()
+
+
+def retarget(
+    clip: Clip,
+    onto: Skeleton | Clip,
+    mapping: Mapping[str, str] | None = None,
+    config: RetargetConfig | None = None,
+    example: Clip | None = None,
+) -> tuple[Clip, RetargetReport]:
+    """The motion of `clip` on another human skeleton.
+
+    Every joint's world rotation passes through the pose that both skeletons share (`common_pose`):
+    W_target = W_source C_source^-1 C_target, so that bones of arms and legs point where they pointed.
+    Spine and neck share their bend out along however many joints there are. The hips follow the source's
+    path scaled by leg length about its start; then feet and hands are put back on the scaled contacts
+    (`plant`).
+
+    Args:
+        onto: the skeleton to move, or a clip on it, which also tells how it stands where its rest pose
+            does not.
+        mapping: joints of the source with the joint that each moves; the others are guessed.
+        example: another clip on the source's skeleton, by default `clip` itself, that tells how the
+            source stands; hand in the same one for all clips that must come out alike.
+
+    Returns:
+        the clip on the other skeleton, same name, rate and length, and what was mapped and measured.
+
+    Raises:
+        PoiseError: a joint that does not exist, a mapping that turns the hierarchy round, a skeleton
+            without pelvis or legs, or one that lies folded at rest and no clip shows how it stands.
+    """
+    began = time.perf_counter()
+    config = config or RetargetConfig()
+    target = onto if isinstance(onto, Skeleton) else onto.skeleton
+    world, passage = World.of(clip), Passage.between(clip, onto, mapping, example, config.scale)
+    if config.rigid:
+        passage = replace(passage, joints=passage.joints.without(config.rigid))
+    rot, root = passage.transfer(world, config.share)
+    feet = feet_of(passage)
+    contacts = source_contacts(clip, world, feet, passage.scale.ground)
+    if config.contacts or config.clear:
+        rot, root = plant(
+            *(clip, world, passage, rot, root, feet, contacts), hold=config.contacts, clear=config.clear
+        )
+    flat = [unwrap_quats(normalize(rot[:, j])) for j in range(len(target))]
+    made = Clip(target, root.numpy(), torch.stack(flat, 1).numpy(), clip.fps, clip.name, clip.cyclic)
+    seconds = time.perf_counter() - began
+    worlds = world, World.of(made)
+    return made, measure(worlds, clip.fps, passage, feet, contacts, seconds)
+
+
+_ARM = ("upper_arm", "forearm", "hand")
+_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+class Rested(NamedTuple):
+    """clip: the same motion on the skeleton with the new rest pose. evidence: from what the pose was
+    found, in a sentence without a full stop. turned_deg: how far joints' frames were turned, mean."""
+
+    clip: Clip
+    evidence: str
+    turned_deg: float
+
+
+def with_rest_pose(clip: Clip) -> Rested:
+    """The same motion on a skeleton that stands in a T-pose with all rotations at zero.
+
+    Every joint stays where it is in every frame; its frame turns. The T-pose faces along -Y, which is
+    +Z in files with Y up; its joints' frames are the world's.
+
+    Raises:
+        PoiseError: a skeleton that is no human's.
+    """
+    roles = find_roles(clip.skeleton)
+    common = common_pose(roles, clip)
+    rot = torch.tensor(common.rot)
+    _straighten(roles, rot)
+    for side in SIDES:
+        _spread(roles, rot, side)
+    face = axis_angle_to_quat(_UP, torch.tensor(-math.pi / 2, dtype=torch.float64))
+    rot = quat_mul(face.expand_as(rot), rot)
+    world = torch.tensor(clip.world()[1])
+    turned = quat_mul(world, quat_conj(rot).expand_as(world))
+    parents = clip.skeleton.parents
+    local = [turned[:, 0]]
+    local += [quat_between(turned[:, p], turned[:, j]) for j, p in enumerate(parents) if p >= 0]
+    made = replace(clip, skeleton=_skeleton(clip.skeleton, rot), rot=torch.stack(local, 1).numpy())
+    angle = 2 * torch.acos(rot[:, 0].abs().clamp(max=1.0))
+    return Rested(made, common.evidence, math.degrees(float(angle.mean())))
+
+
+def _skeleton(skeleton: Skeleton, rot: Tensor) -> Skeleton:
+    """The skeleton with a rest pose of world rotations `rot (J, 4)`; what its file's own frames
+    say is forgotten."""
+    offsets = torch.tensor(skeleton.offsets)
+    above = rot[[max(p, 0) for p in skeleton.parents]]
+    ends = tuple(
+        (j, tuple(quat_rotate(rot[j], torch.tensor(tip, dtype=torch.float64)).tolist()))
+        for j, tip in skeleton.ends
+    )
+    old = skeleton.source
+    channels = tuple(replace(c, axis=None, limits=()) for c in old.channels)
+    source = replace(
+        old,
+        format=old.format if old.format in ("bvh", "gltf") else "poise",
+        notes=(*old.notes, "Its rest pose was made a T-pose"),
+        # What VRM says of its bones stays true, and where a root stands that another joint travels for.
+        extra=tuple(entry for entry in old.extra if entry[0] in ("roles", "root_position")),
+        channels=channels,
+    )
+    return replace(skeleton, offsets=quat_rotate(above, offsets).numpy(), ends=ends, source=source)
+
+
+def _straighten(roles: Roles, rot: Tensor) -> None:
+    """Turns the trunk until the neck, or the head, stands over the foot of the spine."""
+    spine, tops = roles.chain("spine"), (*roles.chain("neck")[:1], *roles.chain("head"))
+    if spine and tops:
+        pos = _places(roles.skeleton, rot)
+        _swing(roles, rot, spine[0], pos[tops[0]] - pos[spine[0]], _UP)
+
+
+def _spread(roles: Roles, rot: Tensor, side: str) -> None:
+    """Turns an arm until its bones point aside."""
+    joints = [j for kind in _ARM if (j := roles.joint(f"{side}_{kind}")) is not None]
+    aside = torch.tensor([0.0, 1.0 if side == "left" else -1.0, 0.0], dtype=torch.float64)
+    for a, b in itertools.pairwise(joints):
+        pos = _places(roles.skeleton, rot)
+        _swing(roles, rot, a, pos[b] - pos[a], aside)
+
+
+def _swing(roles: Roles, rot: Tensor, joint: int, now: Tensor, wanted: Tensor) -> None:
+    """Turns a joint and what hangs on it by the smallest turn that brings `now` to `wanted`."""
+    if float(now.norm()) < 1e-6:
+        return
+    below = subtree(roles.skeleton, joint)
+    turn = shortest_arc(now / now.norm(), wanted)
+    rot[below] = quat_mul(turn.expand(len(below), 4), rot[below])
+
+
+def _places(skeleton: Skeleton, rot: Tensor) -> Tensor:
+    """`(J, 3)` m, of a pose with the world rotations `rot (J, 4)`."""
+    out = [torch.zeros(3, dtype=torch.float64)]
+    for j, p in enumerate(skeleton.parents):
+        if p >= 0:
+            out.append(out[p] + quat_rotate(rot[p], torch.tensor(skeleton.offsets[j])))
+    return torch.stack(out)

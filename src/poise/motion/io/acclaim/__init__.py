@@ -1,1 +1,0 @@
-"""Acclaim (CMU): AMC motion with the ASF skeleton that it needs."""

@@ -1,1 +1,0 @@
-"""Joint angles of a published model: DeepMimic and OpenSim."""

@@ -1,1 +1,0 @@
-"""glTF 2.0: the animated node tree of a .glb or .gltf, and back with a figure to look at."""

@@ -1,1 +1,0 @@
-"""Points in space, markers or keypoints: TRC, C3D, CSV and arrays."""

@@ -1,0 +1,310 @@
+"""Other characters in the same worlds: opponents that act by policies of their own."""
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.control import Compliance, Stiffness
+from poise.env import Reference
+from poise.env.controls import steps
+from poise.env.env import ImitationEnv
+from poise.env.events import InScene, touches_of
+from poise.env.frame import Frame, Observable
+from poise.env.goal import Goal
+from poise.env.plugins import Plugin
+from poise.env.reference import Start
+from poise.env.task import Acts, EnvStep
+from poise.env.yielding import DisplacedGoal
+from poise.errors import PoiseError
+from poise.jobs.track import imitation_of
+from poise.jobs.track.placement import place
+from poise.jobs.tracker import Tracker
+from poise.kinematics import Kinematics
+from poise.machine import one_thread
+from poise.motion.rotations import heading_quat, lateral_heading
+from poise.papers.compliant.motions import AT_SOMEBODY, hopping
+from poise.papers.compliant.scenes import Chicken, Stage
+from poise.papers.compliant.scenes.body_scenes import RIVAL, weighing
+from poise.recipes.imitation import Imitation
+from poise.sim import Backend, Character, CharacterRows, Drive, displaced
+
+
+@dataclass(frozen=True, eq=False)
+class Opponent:
+    """Given to `TaskConfig.plugins`: a character of the scene that another environment drives, step by
+    step with the one that holds the plug-in.
+
+    Unlike `Teams` it lets one environment be looked at as any other; the other's episodes begin where
+    its clip does, with those of all worlds, and never end.
+
+    Attributes:
+        name: of the character in the scene.
+        make: the environment on its rows, without automatic reset.
+        policy: acts for it.
+    """
+
+    name: str
+    make: Callable[[Backend], ImitationEnv]
+    policy: Acts
+
+    def __call__(self, goal: Goal, backend: Backend) -> Opposing:
+        """The plug-in of an environment."""
+        if not isinstance(backend, CharacterRows) or backend.sim is None or len(backend.places) != 1:
+            what = "an opponent needs a scene with one character and itself in each world"
+            raise PoiseError(what, f"Opponent '{self.name}'")
+        return Opposing(self, backend.sim.characters(self.name))
+
+
+class Opposing(Plugin):
+    """`Opponent` in N worlds.
+
+    Attributes:
+        env: its environment.
+    """
+
+    def __init__(self, given: Opponent, rows: CharacterRows):
+        self._policy, self._rows, self.env = given.policy, rows, given.make(rows)
+        self._zero = torch.zeros(rows.num_envs, dtype=torch.long, device=rows.device)
+        self._obs = self.env.reset_to(self._zero, self._zero)
+        self._held: tuple[Tensor, ...] | None = None
+
+    def placed(self, ids: Tensor | None) -> None:
+        """It begins anew where all worlds do."""
+        if ids is None or len(ids) == len(self._zero):
+            self._obs = self.env.reset_to(self._zero, self._zero)
+
+    def push(self, drive: Drive) -> None:
+        """Its action for the control step that begins."""
+        actuation = self.env.controls.actuation
+        self.env.drive(self._policy.act(self._obs))
+        actuation.push()
+        self._held, self._first = actuation.held(), True
+        self._rows.push()
+
+    def busy(self) -> bool:
+        return any(p.busy() for p in self.env.controls.actuation.pushing_substeps)
+
+    def push_substep(self, drive: Drive) -> None:
+        if not self._first:
+            self._rows.pull()
+        self.env.controls.actuation.push_substep(None if self._first else self._held)
+        self._first = False
+        self._rows.push()
+
+    def tick(self) -> None:
+        self._rows.pull()
+        self._obs = self.env.renew(self.env.judge()).obs
+
+
+class Teams:
+    """Environments that share the N worlds of a scene.
+
+    Each is one body with one policy: its own goal, terms, events and help. They act at the same time,
+    and then the worlds are stepped once.
+
+    sim = SceneSim(Scene((Character(tall, "anna"), Character(short, "ben"))), num_envs=16)
+    teams = Teams(
+        {name: task.env(backend=sim.characters(name), guard=False) for name, task in tasks.items()}
+    )
+    teams.reset()
+    step = teams.step({"anna": ..., "ben": ...})
+
+    Args:
+        envs: environments on characters of one `SceneSim`, by name.
+        ends: whether episodes end per "character", or for all of a "world" at once: where one ends,
+            those of the others are cut off like by a time-out.
+    """
+
+    def __init__(
+        self, envs: Mapping[str, ImitationEnv], ends: Literal["character", "world"] = "character"
+    ):
+        if not envs:
+            raise PoiseError("teams need at least one environment", "Teams")
+        self.envs, self.ends, self._rows = dict(envs), ends, dict[str, CharacterRows]()
+        for name, env in envs.items():
+            if not isinstance(env.backend, CharacterRows):
+                raise PoiseError(
+                    "a team's characters are those of a scene",
+                    f"Teams '{name}'",
+                    "Make its environment with backend=SceneSim(...).characters(...)",
+                )
+            self._rows[name] = env.backend
+        first = next(iter(self._rows.values()))
+        self._world = first.world
+        if any(rows.world is not self._world for rows in self._rows.values()):
+            raise PoiseError("teams act in one scene, these are in several", "Teams")
+        claimed = [place.name for rows in self._rows.values() for place in rows.places]
+        twice = next((name for name in claimed if claimed.count(name) > 1), None)
+        if twice is not None:
+            raise PoiseError(f"'{twice}' is in two teams", "Teams")
+        self._substeps = {env.substeps for env in envs.values()}
+        if len(self._substeps) != 1:
+            raise PoiseError("teams need the same physics steps per control step", "Teams")
+
+    @property
+    def num_worlds(self) -> int:
+        """N."""
+        return self._world.num_envs
+
+    def reset(self) -> dict[str, Tensor]:
+        """New episodes everywhere; each team's observations."""
+        for env in self.envs.values():
+            env.reset()
+        return {name: env.observe() for name, env in self.envs.items()}
+
+    @one_thread()
+    def step(self, actions: Mapping[str, Tensor]) -> dict[str, EnvStep]:
+        """One control step for all; `actions` `(N K, A)` of each team."""
+        missing = self.envs.keys() ^ actions.keys()
+        if missing:
+            known = ", ".join(self.envs)
+            raise PoiseError(f"'{min(missing)}' has no action or no team", "Teams", f"Teams: {known}")
+        for name, env in self.envs.items():
+            env.drive(actions[name])
+        (substeps,) = self._substeps
+        steps([env.controls.actuation for env in self.envs.values()], self._advance, substeps)
+        judged = {name: env.judge() for name, env in self.envs.items()}
+        if self.ends == "world":
+            self._end_together(judged)
+        return {name: env.renew(judged[name]) for name, env in self.envs.items()}
+
+    def close(self) -> None:
+        """Frees the worlds."""
+        self._world.close()
+
+    def _advance(self, count: int) -> None:
+        for rows in self._rows.values():
+            rows.push()
+        self._world.step(count)
+        for rows in self._rows.values():
+            rows.pull()
+
+    def _end_together(self, judged: Mapping[str, EnvStep]) -> None:
+        n = self.num_worlds
+        over = torch.zeros(n, dtype=torch.bool, device=self._world.device)
+        for step in judged.values():
+            over |= (step.terminated | step.truncated).view(n, -1).any(1)
+        for step in judged.values():
+            many = len(step.terminated) // n
+            step.truncated.logical_or_(over.repeat_interleave(many) & ~step.terminated)
+
+
+#: m, between both pelvises at first.
+APART_M = 0.85
+
+
+def weighed(task: Imitation, kg: float, ahead_m: float = 0.0) -> Imitation:
+    """A task of a body that weighs so much, `ahead_m` along X from where it was."""
+    body, reference = weighing(task.humanoid, kg), task.reference
+    qpos = reference.qpos.double().numpy().copy()
+    qpos[:, 0] += ahead_m
+    names, frames = task.library.names, reference.length.tolist()
+    ends = [sum(frames[: k + 1]) for k in range(len(frames))]
+    motions = [qpos[end - n : end] for end, n in zip(ends, frames, strict=True)]
+    moved = Reference(body, motions, reference.rate_hz, names)
+    return replace(task, humanoid=body, reference=moved)
+
+
+def rival_stage(scene: Chicken, tracker: Tracker, stage: Stage) -> tuple[Stage, Imitation]:
+    """The stage with the opponent in it, and the opponent's task; its plug-in comes by `opposing`."""
+    clip = hopping(tracker, yaw=math.pi, ways=AT_SOMEBODY)
+    task = weighed(imitation_of(tracker, [place(clip, tracker)]), scene.other, APART_M)
+    felt = touches_of("back", "character", task.humanoid.bodies, f"{RIVAL}/")
+    task = replace(task, task=replace(
+        task.task, plugins=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
+    ))  # fmt: skip
+    rival = Character(task.humanoid, RIVAL)
+    return stage._replace(props=(rival,), touches=(*stage.touches, *felt)), task
+
+
+def opposing(task: Imitation, tracker: Tracker, given: Compliance | Stiffness | None) -> Opponent:
+    """The opponent as a plug-in, which gives way as the player does."""
+    own = replace(task, task=replace(task.task, compliance=given))
+
+    def make(rows: Backend) -> ImitationEnv:
+        return own.env(auto_reset=False, help_scale=0.0, guard=False, backend=rows)
+
+    return Opponent(RIVAL, make, tracker.policy)
+
+
+class Undisplaced(NamedTuple):
+    """q (-) u of N characters (Sec. 4.2): what they would be if they did not give way.
+
+    pos `(N, B, 3)` m and quat `(N, B, 4)` of all bodies in the world, local `(N, J, 4)` turns of hinged
+    bodies, heading `(N, 4)`; before `(N, B, 3)` m, pos one control step earlier.
+    """
+
+    pos: Tensor
+    quat: Tensor
+    local: Tensor
+    heading: Tensor
+    before: Tensor
+
+
+class Shifted(Plugin):
+    """Gives terms `frame.shifted`, see `Undisplaced`; given to `TaskConfig.plugins`.
+
+    The displacement is taken back in the coordinates in which it was added (`sim.displaced`): hinge by
+    hinge, where the logarithm of a joint's turn is the difference of its angles, and of the root.
+
+    Attributes:
+        before: `(N, B, 3)` m, where the bodies were when the last control step began; in a new episode
+            where their velocities say.
+    """
+
+    def __init__(self, goal: Goal, backend: Backend):
+        table, n, here = goal.humanoid.table, backend.num_envs, backend.device
+        self._backend, self._rate = backend, goal.rate_hz
+        self._kinematics = Kinematics(table, torch.float32, here)
+        nothing = torch.zeros(n, goal.humanoid.model.nv, dtype=torch.float64, device=here)
+        self._u = goal.offset if isinstance(goal, DisplacedGoal) else nothing
+        self.before = torch.zeros(n, len(table.rows), 3, device=here)
+
+    @property
+    def observables(self) -> Mapping[str, Observable]:
+        return {"shifted": self._shifted}
+
+    def sources(self) -> Mapping[str, Tensor]:
+        return {"shifted/u": self._u, "shifted/before": self.before}
+
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        body = self._kinematics(*(x.float() for x in start))
+        rows = slice(None) if ids is None else ids
+        self.before[rows] = body.pos - body.linvel / self._rate
+        return start
+
+    def push(self, drive: Drive) -> None:
+        """A control step begins."""
+        state = self._backend.state
+        if not bool(self._u.any()):
+            self.before.copy_(state.xpos[:, 1:])
+            return
+        self.before.copy_(self._kinematics(displaced(state.qpos.double(), -self._u).float()).pos)
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"shifted/before": self.before}
+
+    def state(self) -> dict[str, Tensor]:
+        return {"shifted/before": self.before.clone()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from where the bodies were; from a task that did not know with what is known here."""
+        if "shifted/before" in state:
+            self.before.copy_(state["shifted/before"])
+
+    def _shifted(self, frame: Frame) -> Undisplaced:
+        qpos = displaced(frame.source("qpos").double(), -frame.source("shifted/u")).float()
+        body, root, left = self._kinematics(qpos), qpos[:, 3:7], frame.context.left
+        heading = heading_quat(root) if left is None else lateral_heading(root, left)
+        local = frame.context.local(qpos)
+        return Undisplaced(body.pos, body.quat, local, heading, frame.source("shifted/before"))

@@ -1,0 +1,340 @@
+"""Scenes of Sec. 5.2 and 5.3: throws, hands, chicken, trampoline, a pull at one hand."""
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.body.humanoid import make_humanoid
+from poise.env.events import Happening, InScene, ScenePart, touches_of
+from poise.env.pushes import Push
+from poise.env.reference import Reference
+from poise.env.things import Move, SetDown, Switch, Throw, always
+from poise.errors import PoiseError
+from poise.papers.compliant.scenes.stage import Given, Stage, as_given, hand_of
+from poise.sim import Link, Plane, SceneSim, Touch
+from poise.sim.props import Ball, Box, Carrier
+from poise.sim.props import Trampoline as Plate
+
+
+@dataclass(frozen=True)
+class Hands:
+    """A partner's hand on a straight way beside the character, joined to its hand by a ball joint.
+
+    The partner is not simulated: its hand goes as fast as the motion goes on average, and `lead` faster,
+    and swings by `sway` along the way and up and down.
+
+    Attributes:
+        side: of the character's hand.
+        lead: m/s.
+        sway: m, to either side.
+        every_s: s, the time of a swing.
+    """
+
+    side: Literal["left", "right"] = "left"
+    lead: float = 0.0
+    sway: float = 0.1
+    every_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (abs(self.lead) < 10.0 and 0.0 <= self.sway < 1.0 and self.every_s > 0.1):
+            raise PoiseError(
+                "the partner's lead must be below 10 m/s, its sway below 1 m, a swing longer than 0.1 s",
+                "hands",
+            )
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """The partner's hand where the character's is at first, and the link; its force is felt."""
+        row = hand_of(humanoid, self.side, "hands")
+        frames, pose = int(reference.length[0]), reference.pose
+        x, y, z = (float(v) for v in pose.pos[0, row])
+        way = (pose.pos[frames - 1, 0, :2] - pose.pos[0, 0, :2]).double()
+        speed = way * reference.rate_hz / max(1, frames - 1)
+        size = float(speed.norm())
+        # A motion that stays is led where its left is, or where it goes.
+        ahead = speed / size if size > 0.1 else torch.tensor([0.0, 1.0]).double()
+        velocity = speed + self.lead * ahead
+        name, body = "partner", humanoid.bodies[row]
+        prop = Carrier(name, (0.09, 0.09, 0.09), (x, y, z), touched=False)
+        part = InScene(
+            sees=(name,),
+            felt=("hands",),
+            events=(Move(name, self._path(velocity, ahead)), Switch("hands", always)),
+        )
+        return Stage((prop,), (Link("hands", name, body, "ball", measured=True),), (), (part,))
+
+    def _path(self, velocity: Tensor, ahead: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+        w = 2.0 * math.pi / self.every_s
+
+        def path(seconds: Tensor) -> tuple[Tensor, Tensor]:
+            t = seconds.double().unsqueeze(1)
+            swing, rate = self.sway * torch.sin(w * t), self.sway * w * torch.cos(w * t)
+            still = torch.zeros_like(t)
+            qpos = torch.cat((velocity * t + ahead * swing, 0.5 * swing, still), 1)
+            qvel = torch.cat((velocity + ahead * rate, 0.5 * rate, still), 1)
+            return qpos, qvel
+
+        return path
+
+
+#: What the other one is called in the scene.
+RIVAL = "rival"
+#: kg, of the paper's players.
+HEAVY_KG, LIGHT_KG = 85.0, 36.0
+
+
+@dataclass(frozen=True)
+class Chicken:
+    """A player hops on one leg and bumps into what weighs as much as its opponent: a punching bag that
+    comes at it from all around, as the paper trains it, or the opponent itself, hopping, too.
+
+    Masses scale inertia, gains and torques of the same body, so that each player alone moves alike.
+
+    Attributes:
+        mass, other: kg, of the player and its opponent.
+        against: "bag" or "rival".
+        speed: m/s of the bag, drawn between.
+        seed: of the draws.
+    """
+
+    mass: float = HEAVY_KG
+    other: float = LIGHT_KG
+    against: Literal["bag", "rival"] = "bag"
+    speed: tuple[float, float] = (0.8, 1.2)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (2.0 <= self.mass <= 500.0 and 2.0 <= self.other <= 500.0):
+            raise PoiseError(
+                f"players weigh 2 to 500 kg, got {self.mass:g} and {self.other:g}", "chicken"
+            )
+        if self.against not in ("bag", "rival"):
+            raise PoiseError(f"it is played against a bag or a rival, got '{self.against}'", "chicken")
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """The bag, its throws and all touches with it; of a rival the touches alone."""
+        name = "bag" if self.against == "bag" else RIVAL
+        touches = touches_of("felt", name, humanoid.bodies)
+        felt = tuple(t.name for t in touches)
+        if self.against == "rival":
+            return Stage((), (), touches, (InScene(felt=felt),), from_start=True)
+        chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
+        far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
+        throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
+        bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other)
+        return Stage((bag,), (), touches, (InScene(felt=felt, events=(far, throw)),), from_start=True)
+
+
+def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
+    """The same body with another mass; inertia, gains and torques grow with it.
+
+    What it does under the same angles of its servos stays the same, and so does its policy.
+    """
+    table = humanoid.table
+    s = kg / table.mass
+    rows = tuple(
+        replace(
+            r, mass=s * r.mass, kp=s * r.kp, kd=s * r.kd, torque=s * r.torque, armature=s * r.armature
+        )
+        for r in table.rows
+    )
+    return make_humanoid(humanoid.skeleton, replace(table, rows=rows))
+
+
+@dataclass(frozen=True)
+class Pull:
+    """A constant force at one hand.
+
+    Attributes:
+        newtons: of it.
+        side: of the hand.
+        direction: of the force in the world, Z up, of any length.
+        start_s: s, when it begins.
+        lasts_s: s, for how long.
+    """
+
+    newtons: float = 20.0
+    side: Literal["left", "right"] = "left"
+    direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    start_s: float = 0.5
+    lasts_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        size = float(np.linalg.norm(self.direction))
+        if not (0.0 < self.newtons < 1e4 and size > 0.0 and np.isfinite(size)):
+            raise PoiseError("a pull needs a force above 0 N and a direction", "pull")
+        if not (self.start_s >= 0.0 and self.lasts_s > 0.0):
+            raise PoiseError("a pull begins at 0 s or later and lasts some time", "pull")
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """The force at the hand's centre of mass."""
+        row = hand_of(humanoid, self.side, "pull")
+        unit = np.asarray(self.direction) / np.linalg.norm(self.direction)
+        x, y, z = (float(self.newtons * v) for v in unit)
+        rate = reference.rate_hz
+        steps = max(1, round(self.lasts_s * rate))
+        return Stage(plugins=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
+
+
+@dataclass(frozen=True)
+class Throws:
+    """A ball that comes at the chest from all around, again and again.
+
+    Attributes:
+        mass: kg.
+        speed: m/s along the ground, drawn between.
+        every_s: s between throws, drawn between.
+        seed: of the draws.
+    """
+
+    mass: float = 1.0
+    speed: tuple[float, float] = (2.0, 3.0)
+    every_s: tuple[float, float] = (1.0, 1.5)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.mass < 100.0:
+            raise PoiseError(f"a ball must weigh above 0 and below 100 kg, got {self.mass:g}", "throws")
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """A ball that waits far off, touches of each body, and throws; "hit" is metered."""
+        chest = (humanoid.rows_of("spine") or (0,))[-1]
+        touches = touches_of("felt", "ball", humanoid.bodies)
+        hit = Touch("hit", "ball", "character")
+        part = InScene(
+            metered=(hit.name,),
+            felt=tuple(t.name for t in touches),
+            events=(
+                SetDown("ball", (30.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)),
+                Throw("ball", humanoid.bodies[chest], self.speed, every_s=self.every_s, seed=self.seed),
+            ),
+        )
+        return Stage((Ball(mass=self.mass),), (), (*touches, hit), (part,))
+
+
+#: s from bounce to bounce, and from a contact on for which the character gives way.
+EVERY_S, GIVES_S = 3.0, 1.0
+#: s: how long a bounce's actuators are up. N on the feet is contact.
+UP_S, CONTACT_N = 0.12, 20.0
+#: m, the floor below the plate.
+BELOW_M = -1.0
+
+
+@dataclass(frozen=True)
+class Trampoline:
+    """A rigid plate on four linear actuators, which throws the character up every 3 s.
+
+    Contacts of the feet are given way to for 1 s after the feet have come down again.
+
+    Attributes:
+        height: m, by which the actuators rise for a bounce.
+        first: s, when the first bounce begins.
+    """
+
+    height: float = 0.15
+    first: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.height <= 1.0:
+            raise PoiseError(f"a bounce is 0 to 1 m high, got {self.height:g}", "trampoline")
+        if not 0.0 <= self.first < EVERY_S:
+            what = f"the first bounce begins within {EVERY_S:g} s, got {self.first:g}"
+            raise PoiseError(what, "trampoline")
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """The plate in place of the floor, its bounces, and the feet's contacts."""
+        # In the middle of what the motion crosses.
+        low, high = torch.aminmax(reference.pose.pos[:, 0, :2], dim=0)
+        x, y = (0.5 * (low + high)).tolist()
+        plate = Plate(pos=(x, y, 0.0))
+        feet = tuple(humanoid.bodies[i] for i in humanoid.feet)
+        touches = touches_of("felt", plate.name, feet)
+        names = tuple(t.name for t in touches)
+        bounce = Bounce(plate.name, self.height, names, self.first)
+        part = InScene(
+            sees=(plate.name,), felt=names, felt_part=dict.fromkeys(names, after_contact),
+            events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
+        )  # fmt: skip
+        return Stage((plate,), (), touches, (part,), from_start=True,
+                     floor=Plane(BELOW_M), yields=stands_still)  # fmt: skip
+
+
+def stands_still(given: Given | None) -> Given:
+    """Gives way by the hinges alone: with the root the goal would slide away from under the feet."""
+    return replace(as_given(given), root=False)
+
+
+def after_contact(part: ScenePart, force: Tensor) -> Tensor:
+    """A force where the character gives way just now, else 0."""
+    bounce = next(h for h in part.happenings if isinstance(h, Bouncing))
+    return force * (bounce.gives > 0).to(force).unsqueeze(1)
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """A plate's actuators rise for a moment, every 3 s.
+
+    Attributes:
+        plate: its name.
+        height: m.
+        touches: of the feet with it.
+        first: s, when the first bounce begins.
+    """
+
+    plate: str
+    height: float
+    touches: tuple[str, ...]
+    first: float = 1.0
+
+    def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
+        """The event in the worlds of a scene."""
+        return Bouncing(self, sim, control_hz)
+
+
+class Bouncing(Happening):
+    """`Bounce` in N worlds.
+
+    Attributes:
+        steps: `(N,)` control steps since the episode began.
+        air: `(N,)` whether the feet have left the plate since the last bounce began.
+        gives: `(N,)` control steps for which the character gives way yet.
+        first_s: s, when the first bounce begins.
+    """
+
+    def __init__(self, event: Bounce, sim: SceneSim, control_hz: float):
+        self.first_s = event.first
+        self._event, self._sim, self._hz = event, sim, control_hz
+        self._controls = sim.scene.place(event.plate).controls
+        here = sim.backend.device
+        self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=here)
+        self.gives, self.air = torch.zeros_like(self.steps), torch.zeros_like(self.steps)
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"steps": self.steps, "gives": self.gives, "air": self.air}
+
+    def begin(self, worlds: Tensor) -> None:
+        for value in (self.steps, self.gives, self.air):
+            value[worlds] = 0
+
+    def before(self) -> None:
+        since = self.steps / self._hz - self._event.first
+        up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
+        drive = self._sim.backend.drive.ctrl
+        drive[:, self._controls] = self._event.height * up.to(drive).unsqueeze(1)
+
+    def after(self) -> None:
+        self.steps += 1
+        force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self._event.touches)
+        stands = torch.as_tensor(force) > CONTACT_N
+        down = stands & (self.air > 0)
+        self.gives = torch.where(down, round(GIVES_S * self._hz), (self.gives - 1).clamp_min(0))
+        self.air = (~stands).long()

@@ -1,0 +1,428 @@
+"""The settings of a run of the perpetual controller, each ablation of the paper one switch of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from poise.body import BodyConfig
+from poise.errors import PoiseError
+from poise.learn import (
+    AmpConfig,
+    CloneConfig,
+    ConvergenceConfig,
+    LessonConfig,
+    MiningConfig,
+    PPOConfig,
+)
+from poise.plan import TeacherConfig, TrajOptConfig
+from poise.recipes.shapes import BodyShapes
+from poise.settings import Migration, from_data, validate
+from poise.sim import SimConfig
+
+#: Deviations from the mean at which observations are clipped, so that lying is told from leaning.
+WIDE = 30.0
+
+
+#: As what a stage learns recovery, see `Recovery.phc`.
+Recovers = Literal["primitive", "composer"]
+
+
+@dataclass(frozen=True)
+class RecoveryPlan:
+    """How recovery is learned and judged.
+
+    Attributes:
+        share: of the whole training, what the recovery primitive has at least; of a single network it is
+            taken from the part without recovery.
+        falls: different fallen characters to begin from.
+        primitive: which of them recovers: one of its "own", after those that track, or the "first",
+            where that is a policy that goes on and can come back already.
+        demonstrations: how many recovery motions are made of the library's own clips, where some get up
+            and some walk, see `env.recovery.planner`; 0 learns to come back to a point, as the paper
+            does.
+        demonstration_share: of the episodes of a stage that tracks and recovers, how many are of them.
+        quick: they get up and walk back a second sooner, see `env.recovery.clips.QUICK`.
+        trials, final_trials: of each kind of fail-state, at evaluations and with the finished policy.
+        seconds: a character counts as back within each of these times; the last one decides.
+        enough: share of all trials with which recovery is learned.
+    """
+
+    share: float = 0.15
+    primitive: Literal["own", "first"] = "own"
+    falls: int = 512
+    demonstrations: int = 768
+    demonstration_share: float = 0.5
+    quick: bool = False
+    trials: int = 32
+    final_trials: int = 100
+    seconds: tuple[float, ...] = (5.0, 10.0)
+    enough: float = 0.98
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if not 0 < self.share < 1 or not 0 < self.enough <= 1:
+            what = f"share must lie in (0, 1) and enough in (0, 1], got {self.share} and {self.enough}"
+            raise PoiseError(what, "RecoveryPlan")
+        if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
+            raise PoiseError("recovery needs falls, trials and seconds", "RecoveryPlan")
+        if self.demonstrations < 0 or not 0 < self.demonstration_share < 1:
+            what = (
+                f"got {self.demonstrations} demonstrations and a demonstration_share of "
+                f"{self.demonstration_share:g}"
+            )
+            raise PoiseError(what, "RecoveryPlan", "None or more, and a share between 0 and 1")
+
+
+@dataclass(frozen=True)
+class PushPlan:
+    """Pushes in training, to which goals give way by Deep Compliant Control's law.
+
+    Attributes:
+        share: of the episodes that are pushed.
+        newtons, every_s, lasts_s, impulse_ns: see `env.events.Pushes`.
+        parts: kinds of bodies of which one is pushed.
+        level: between which the level of compliance is drawn in each episode.
+    """
+
+    share: float = 0.5
+    newtons: tuple[float, float] = (20.0, 200.0)
+    every_s: tuple[float, float] = (0.3, 2.0)
+    lasts_s: tuple[float, float] = (0.1, 2.0)
+    impulse_ns: float = 50.0
+    parts: tuple[str, ...] = ("pelvis", "spine", "head", "hand", "upper_arm")
+    level: tuple[float, float] = (0.0, 0.2)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if not 0.0 < self.share <= 1.0 or not self.parts:
+            raise PoiseError(f"pushes need a share above 0 and parts, got {self.share:g}", "PushPlan")
+
+
+@dataclass(frozen=True)
+class Perpetual:
+    """Settings of one run.
+
+    Attributes:
+        goal: what is told of the next frame, "rotations" and places or "keypoints", which are places
+            alone.
+        shape: limb lengths and masses are observed, too.
+        shapes: the bodies that are learned; more than one are observed in any case.
+        heading: of which all that is observed is free: where the axis from hip to hip points on the
+            ground ("hips"), which is singular only where that is vertical, or the root's "twist" about
+            +Z, which turns at once where the body is upside down.
+        window: control steps ahead of which the observation tells the reference's place, heading and
+            `KEY_PARTS` besides the next one's whole pose, such as (2, 4, 8); a stream's last known frame
+            is repeated.
+        filter: share of the last action that actions keep, see `TaskConfig.filter`; the policy then
+            observes the last action. 0 for none.
+        action: "absolute" as in the paper, or "additive" to the reference's angles.
+        faithful: where the paper and its code disagree about Eq. 2 and about recovery.
+        energy: weight of the energy penalty, 0 for none; by default that of the code's composer, since
+            with ten times as much falling early would pay, see `phc_reward.energy_term`.
+        energy_form: of the "paper", squares of the hinges' power, or of the "code", its amount.
+        root: weight of the reward for the root's place alone, see `phc_reward.root_position`.
+        action_rate, torque_rate, acceleration, foot_slide: prices of changing actions and torques, of
+            bodies accelerated otherwise than the reference's and of feet that slide, see `phc_reward`;
+            with several bodies the soles are those of the first.
+        noise: each clip is learned once more with so many times a video estimator's noise, such as
+            (0.25, 0.5), of which the policy is told, and is judged by the clean clip, see `noisy`.
+        pushes: a share of the episodes is pushed, and goals give way; the policy observes how, see
+            `phc_obs.yielding`. None: neither.
+        style: the motion prior, None for none.
+        termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
+            "code".
+        first: share of the episodes that begin on frame 0, as evaluations do.
+        recovery: fallen and far characters get up and come back, by a primitive of its own and in the
+            composer's training; `recovering` says how. Without, it is not learned.
+        multiplicative: off, there is one network of a primitive's size and nothing that combines.
+        progressive: off, all primitives and the composer learn together from the start, on all clips.
+        single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
+            `ppo.policy_hidden` and a composer of `composer_hidden`.
+        max_primitives: no more than so many; fewer where nothing fails any more. That of recovery is one
+            more.
+        start: a primitive begins as a "copy" of the one before it, or "random".
+        lateral: whether it sees the hidden layers of the earlier ones.
+        combine, weights: see `nets.Composer`.
+        composer_clone: the composer first imitates for each clip the primitive that learned it.
+        expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits
+            the frames of the library where that is None, see `jobs.perpetual.cloning`.
+        trajopt: the expert follows trajectories that need no help, which are optimised first, see
+            `plan.trajopt`; None takes inverse dynamics, which need help.
+        help_start: N and N m, what the residual force may give at first; 0 does without. In each stage
+            it has ended at the share `help_share` of the stage's time, or before by success.
+        help_by: success is that of each "bin" of a clip, a second or so, which keeps or loses help of
+            its own, of each "clip", or of "all" episodes.
+        adaptive_sampling: share of the episodes (but for those on frame 0) that begin up to two seconds
+            before where others lately failed; the rest begin anywhere, as in the paper.
+        adaptive_over: such places of the "clip" that was drawn, or of the whole "library", so that more
+            is seen of long and hard clips.
+        residual_std: deviation of the noise on the residual action, in units of the limits.
+        shares: where in the training the first and the last primitive end at the latest; with recovery,
+            of what `recovering.share` leaves.
+        evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of
+            the control steps.
+        starts: frames of each clip from which evaluations begin, evenly spread; a clip succeeds where it
+            does from all of them.
+        cooling: share of a stage's longest time, at its end, in which the policy's step size falls
+            evenly to a tenth; for steps of a fixed size, `ppo.kl_target=None`.
+        mining, convergence: what fails is trained more; when a stage has learned what it can.
+        teacher: lookahead that says what the policy should have done, None for none; PPO then trains
+            the critic alone, unless `lessons.reinforce`.
+        lessons: how is learned from it.
+    """
+
+    goal: Literal["rotations", "keypoints"] = "rotations"
+    shape: bool = False
+    shapes: BodyShapes = field(default_factory=BodyShapes)
+    heading: Literal["hips", "twist"] = "hips"
+    window: tuple[int, ...] = ()
+    filter: float = 0.0
+    action: Literal["absolute", "additive"] = "absolute"
+    faithful: Literal["paper", "code"] = "code"
+    energy: float = 0.00005
+    energy_form: Literal["paper", "code"] = "code"
+    root: float = 0.0
+    action_rate: float = 0.0
+    torque_rate: float = 0.0
+    acceleration: float = 0.0
+    foot_slide: float = 0.0
+    noise: tuple[float, ...] = ()
+    pushes: PushPlan | None = None
+    style: AmpConfig | None = field(default_factory=AmpConfig)
+    termination: Literal["relaxed", "all", "code"] = "relaxed"
+    first: float = 0.1
+    recovery: bool = True
+    recovering: RecoveryPlan = field(default_factory=RecoveryPlan)
+    multiplicative: bool = True
+    progressive: bool = True
+    single: bool = False
+    max_primitives: int = 3
+    start: Literal["copy", "random"] = "copy"
+    lateral: bool = False
+    combine: Literal["product", "means"] = "product"
+    weights: Literal["softmax", "softplus", "relu", "silu"] = "softmax"
+    single_hidden: tuple[int, ...] = (1024, 512, 512)
+    composer_hidden: tuple[int, ...] = (256, 128)
+    composer_clone: bool = True
+    expert: bool = True
+    trajopt: TrajOptConfig | None = None
+    help_start: float = 100.0
+    help_share: float = 0.8
+    help_by: Literal["all", "clip", "bin"] = "bin"
+    adaptive_sampling: float = 0.5
+    adaptive_over: Literal["clip", "library"] = "clip"
+    residual_std: float = 0.3
+    shares: tuple[float, float] = (0.5, 0.8)
+    evaluate_every: int = 0
+    starts: int = 1
+    cooling: float = 0.0
+    num_envs: int = 512
+    horizon: int = 300
+    seed: int = 0
+    mining: MiningConfig = field(default_factory=MiningConfig)
+    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
+    clone: CloneConfig | None = None
+    teacher: TeacherConfig | None = None
+    lessons: LessonConfig = field(default_factory=LessonConfig)
+    body: BodyConfig = field(default_factory=BodyConfig)
+    sim: SimConfig = field(default_factory=SimConfig)
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            std=0.02,
+            policy_lr=2e-5,
+            kl_target=0.05,
+            lr_range=(5e-6, 3e-4),
+            policy_hidden=(512, 256),
+        )
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.starts < 1:
+            raise PoiseError(f"starts must be at least 1, got {self.starts}", "Perpetual")
+        if self.max_primitives < 1:
+            raise PoiseError(f"there must be at least 1 primitive, got {self.max_primitives}")
+        first, last = self.shares
+        if not 0 < first <= last <= 1:
+            raise PoiseError(f"shares must rise within (0, 1], got {self.shares}", "Perpetual")
+        if self.recovery and last == 1:
+            what = "with recovery something must follow the last primitive, got shares up to 1"
+            raise PoiseError(what, "Perpetual")
+        if not 0 < self.help_share <= 1:
+            raise PoiseError(f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual")
+        if self.recovering.primitive == "first" and self.max_primitives < 2:
+            what = "where the first primitive recovers there must be another, got max_primitives=1"
+            raise PoiseError(what, "Perpetual")
+        if self.goal == "keypoints" and self.action == "additive":
+            what = "additive actions need the next frame's angles, of which keypoints tell nothing"
+            raise PoiseError(what, hint="Take absolute actions, or rotations as the goal")
+        if not 0 <= self.adaptive_sampling <= 1:
+            what = f"adaptive_sampling must lie in [0, 1], got {self.adaptive_sampling}"
+            raise PoiseError(what, "Perpetual")
+        if list(self.window) != sorted({k for k in self.window if k > 1}):
+            what = f"window must rise from 2 or more control steps, got {self.window}"
+            raise PoiseError(what, "Perpetual", "The next step is told in any case")
+        if not 0 <= self.filter < 1:
+            raise PoiseError(f"filter must lie in 0 to below 1, got {self.filter}", "Perpetual")
+        prices = self.action_rate, self.torque_rate, self.acceleration, self.foot_slide
+        if min(self.root, *prices) < 0:
+            raise PoiseError("the weight of root and all prices must be at least 0", "Perpetual")
+        if any(not 0 < x < 100 for x in self.noise) or len(set(self.noise)) < len(self.noise):
+            raise PoiseError(f"noise needs different strengths above 0, got {self.noise}", "Perpetual")
+        if self.noise and self.shapes.several:
+            raise PoiseError("noise is learned on one body, and there are several shapes", "Perpetual")
+        if not 0 <= self.cooling <= 1:
+            raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")
+        if self.cooling and self.ppo.kl_target is not None:
+            what = "cooling is for steps of a fixed size, and kl_target adapts them"
+            raise PoiseError(what, "Perpetual", "Set kl_target=None, or leave cooling out")
+        if self.trajopt is not None and self.shapes.several:
+            what = "trajectories are optimised for one body, and there are several shapes"
+            raise PoiseError(what, "Perpetual", "Leave one of the two out")
+        if self.ppo.learn_std:
+            raise PoiseError("primitives keep their action noise", "Perpetual", "Set learn_std=False")
+        self._check_networks()
+
+    def _check_networks(self) -> None:
+        other = [n for n in ("multiplicative", "progressive") if not getattr(self, n)]
+        if len(other) + self.single > 1:
+            given = " and ".join([*(["single"] if self.single else []), *(f"no {n}" for n in other)])
+            what = f"only one of single, no multiplicative and no progressive can be, got {given}"
+            raise PoiseError(what, hint="Each of them is another network; leave one out")
+        if not self.progressive and self.combine != "product":
+            raise PoiseError(
+                "primitives that learn with their composer are combined as a product",
+                "Perpetual",
+                "Set combine='product'",
+            )
+        if not self.progressive and self.max_primitives < 2:
+            raise PoiseError("a composer without progressive training needs at least 2 primitives")
+
+    @classmethod
+    def additive(cls, **changes: Any) -> Perpetual:
+        """Settings for hours on a CPU: actions add to the reference's angles, with noise in radians
+        that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
+        stage has more evaluations before it counts as learned. Many worlds make large batches: what one
+        hard motion bin of many tells is lost in small ones, with steps large enough to learn it.
+        Adaptive sampling over the whole library draws half of the starts; the others are anywhere.
+        Observations are clipped far out, since lying on the floor is far from the mean of walks."""
+        ppo = replace(
+            cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3,
+            obs_clip=WIDE,
+        )  # fmt: skip
+        own: dict[str, Any] = {
+            "ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None, "num_envs": 2048,
+            "adaptive_over": "library", "mining": MiningConfig(rule="uniform"),
+        }  # fmt: skip
+        return cls(action="additive", **(own | changes))
+
+    @classmethod
+    def paper(cls, **changes: Any) -> Perpetual:
+        """All that the paper states, for a GPU and a week. changes: settings that differ.
+
+        PPO, the number of worlds and what of the motion prior the paper leaves open (Sec. 3.1) are the
+        code's, see `code`. Of the two ways in which a primitive begins (Sec. 3.2), lateral connections
+        to random weights are taken; start="copy", lateral=False is the other.
+
+        Not expressed: the SMPL body with its gains (kd = 0.1 kp here as there), a composer with
+        weights that only have to be positive (softmax), and an episode that is worth nothing after its
+        last frame.
+        """
+        own: dict[str, Any] = {
+            "faithful": "paper", "energy_form": "paper", "termination": "relaxed",
+            "style": AmpConfig.phc("paper"), "mining": MiningConfig.phc("paper"),
+            "start": "random", "lateral": True, "combine": "product", "weights": "softmax",
+        }  # fmt: skip
+        return cls(**(_PHC | own | changes))
+
+    @classmethod
+    def code(cls, **changes: Any) -> Perpetual:
+        """All that the authors' code does, of the version with the paper; changes: settings that differ.
+
+        Not expressed: action noise on the composer's weights (here on the actions), the energy weight of
+        0.00005 in the composer's stage alone, gains that differ between the SMPL body's joints, a critic
+        and a discriminator that share PPO's optimiser, a new set of clips in memory every 500 epochs,
+        fallen starts alone until a given epoch, and an episode that is worth nothing after its end.
+        """
+        own: dict[str, Any] = {
+            "faithful": "code", "energy_form": "code", "termination": "code",
+            "style": AmpConfig.phc("code"), "mining": MiningConfig.phc("code"),
+            "start": "copy", "lateral": False, "combine": "means", "weights": "relu",
+        }  # fmt: skip
+        return cls(**(_PHC | own | changes))
+
+    def taught(self) -> Perpetual:
+        """The same settings with a teacher that looks ahead. What is observed and done suits it: the
+        heading of the hips, later frames, a filter of actions. Most time is the teacher's, and few
+        worlds train the critic."""
+        recovering = replace(self.recovering, demonstration_share=0.15)
+        return replace(
+            self, heading="hips", window=(2, 4, 8), filter=0.5, root=0.2, num_envs=128,
+            recovering=recovering, teacher=TeacherConfig(),
+        )  # fmt: skip
+
+    @property
+    def widens(self) -> bool:
+        """Whether ranges of hinges may grow after training: absolute targets are shares of them."""
+        return self.action == "additive"
+
+    @property
+    def method(self) -> str:
+        """What a score card calls it."""
+        kinds = {"single": self.single, "plain": not self.multiplicative, "joint": not self.progressive}
+        return "-".join(["perpetual", *(name for name, other in kinds.items() if other)])
+
+    @property
+    def help_limit(self) -> float:
+        """N and N m that are left at the end."""
+        return 0.0
+
+
+#: What `Perpetual.paper` and `.code` share. The paper: goals, absolute actions, no help, networks of
+#: 1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds, steps.
+_PHC: dict[str, Any] = {
+    "goal": "rotations", "shape": False, "heading": "twist", "action": "absolute",
+    "energy": 0.0005, "first": 0.0,
+    "recovery": True, "recovering": RecoveryPlan(primitive="own", demonstrations=0),
+    "multiplicative": True, "progressive": True, "single": False, "max_primitives": 3,
+    "composer_hidden": (1024, 512), "composer_clone": False, "expert": False, "trajopt": None,
+    "help_start": 0.0, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip",
+    "cooling": 0.0, "num_envs": 3072, "horizon": 300,
+    "body": BodyConfig(damping=0.1, armature=0.02),
+    "sim": SimConfig(rate_hz=60.0, control_hz=30.0),
+    "ppo": PPOConfig(
+        horizon=32, minibatch=16_384, epochs=6, gamma=0.99, lam=0.95, clip=0.2, policy_lr=2e-5,
+        value_lr=2e-5, policy_grad_norm=50.0, value_grad_norm=50.0, policy_hidden=(1024, 512),
+        value_hidden=(1024, 512), activation="relu", std=math.exp(-2.9), bound_weight=10.0,
+        bound_limit=1.0, kl_target=None, kl_stop=None, normalise_returns=True, obs_clip=5.0,
+        bootstrap_timeouts=True,
+    ),
+}  # fmt: skip
+
+#: What earlier versions called the settings, and what their runs did that name none.
+MIGRATION = Migration(
+    keys={
+        "hard_starts": "adaptive_sampling", "hard_over": "adaptive_over", "paths": "trajopt",
+        "trajopt.stretch_s": "trajopt.segment_s",
+        "trajopt.plan.frequency": "trajopt.plan.spring.frequency",
+        "trajopt.plan.damping": "trajopt.plan.spring.damping",
+        "trajopt.plan.turn_frequency": "trajopt.plan.spring.turn_frequency",
+        "trajopt.plan.turn_damping": "trajopt.plan.spring.turn_damping",
+        "recovering.ways": "recovering.demonstrations",
+        "recovering.way_share": "recovering.demonstration_share",
+    },
+    values={"help_by": {"moment": "bin"}},
+    absent={
+        "recovery": False, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip",
+        "heading": "twist",
+    },
+)  # fmt: skip
+
+
+def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Perpetual:
+    """The settings that a run or a policy file holds as JSON data, also of earlier versions."""
+    return from_data(Perpetual, MIGRATION(data), where)

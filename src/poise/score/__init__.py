@@ -1,0 +1,50 @@
+"""Evaluation: padded rollouts in, a score card with stable keys out."""
+
+from poise.score.card import THRESHOLDS, Help, Row, ScoreCard, Threshold, read_score, table, write_score
+from poise.score.episodes import (
+    Nothing,
+    Observer,
+    Recorder,
+    Recording,
+    Transitions,
+    perturb,
+    record_transitions,
+    run_episodes,
+    run_in_batches,
+    simulate,
+    start_frames,
+)
+from poise.score.recovered import RecoveryCard, recovery_card, trial_task
+from poise.score.rollouts import ClipJudge, ClipResults, RolloutSet
+from poise.score.scorecard import TRACKING, clip_figures, score_rollouts
+
+__all__ = [
+    "THRESHOLDS",
+    "TRACKING",
+    "ClipJudge",
+    "ClipResults",
+    "Help",
+    "Nothing",
+    "Observer",
+    "Recorder",
+    "Recording",
+    "RecoveryCard",
+    "RolloutSet",
+    "Row",
+    "ScoreCard",
+    "Threshold",
+    "Transitions",
+    "clip_figures",
+    "perturb",
+    "read_score",
+    "record_transitions",
+    "recovery_card",
+    "run_episodes",
+    "run_in_batches",
+    "score_rollouts",
+    "simulate",
+    "start_frames",
+    "table",
+    "trial_task",
+    "write_score",
+]

@@ -1,0 +1,408 @@
+"""Props of a scene: whatever is no character."""
+
+# pyright: reportUnknownArgumentType=false, reportUnknownVariableType=false
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.sim.floor import FRICTION
+
+Vector = tuple[float, float, float]
+
+
+class Prop(Protocol):
+    """A thing in a scene: one tree of bodies; the first has the prop's name.
+
+    All names that it gives in a description are its own name, or begin with it and "/".
+    """
+
+    @property
+    def name(self) -> str:
+        """How the scene calls it."""
+        ...
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds its bodies, joints, actuators and assets to a description."""
+        ...
+
+
+def solid(
+    body: mujoco.MjsBody, name: str, kind: str, size: Sequence[float], **more: Any
+) -> mujoco.MjsGeom:
+    """Adds a geom with the friction of props: "box", "sphere", "capsule", "cylinder" or "mesh"."""
+    geom = body.add_geom(
+        name=name, type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), condim=3, **more
+    )
+    geom.size = [*size, *[0.0] * (3 - len(size))]
+    geom.friction = list(FRICTION)
+    return geom
+
+
+def above_zero(where: str, **values: float | Sequence[float]) -> None:
+    """Raises where a number, or one of several, is not finite and above 0."""
+    for name, value in values.items():
+        numbers = value if isinstance(value, Sequence) else (value,)
+        if not all(0.0 < x < float("inf") for x in numbers):
+            raise PoiseError(f"{name} must be above 0, got {value}", where)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box.
+
+    Attributes:
+        name: how the scene calls it.
+        size: m, its full extents.
+        pos: m, its centre at first.
+        quat: wxyz, box to world at first.
+        mass: kg; 0 fixes it to the world.
+    """
+
+    name: str = "box"
+    size: Vector = (0.4, 0.4, 0.4)
+    pos: Vector = (0.0, 0.0, 0.2)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        above_zero(f"Box '{self.name}'", size=self.size)
+        if self.mass != 0.0:
+            above_zero(f"Box '{self.name}'", mass=self.mass)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), quat=list(self.quat))
+        if self.mass:
+            body.add_freejoint(name=self.name)
+        solid(body, self.name, "box", [s / 2 for s in self.size], mass=self.mass)
+
+
+#: kg; what touches it hardly moves it between two control steps.
+MASS = 1e5
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """A plate with a motion of its own: a moving walkway, a hand that leads, a vehicle.
+
+    A mocap body of MuJoCo has no velocity, so that it carries nothing and pulls with a lag. This one is
+    so heavy that nothing turns it from its way: set its four coordinates (x, y, z in m from `pos`, and
+    the turn about Z in rad) and their rates each control step (`SceneSim.place`), and it keeps that
+    velocity until the next.
+
+    Attributes:
+        name: how the scene calls it.
+        size: m, its full extents.
+        pos: m, its centre at coordinates 0.
+        touched: whether things touch it; a hand that leads by a link need not be touched.
+    """
+
+    name: str = "carrier"
+    size: Vector = (1.0, 1.0, 0.1)
+    pos: Vector = (0.0, 0.0, 0.05)
+    touched: bool = True
+
+    def __post_init__(self) -> None:
+        above_zero(f"Carrier '{self.name}'", size=self.size)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body on three slides and a hinge."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), gravcomp=1.0)
+        for axis, along in AXES.items():
+            slide = mujoco.mjtJoint.mjJNT_SLIDE
+            body.add_joint(name=f"{self.name}/{axis}", type=slide, axis=list(along))
+        hinge = mujoco.mjtJoint.mjJNT_HINGE
+        body.add_joint(name=f"{self.name}/turn", type=hinge, axis=[0, 0, 1])
+        geom = solid(body, self.name, "box", [s / 2 for s in self.size], mass=MASS)
+        if not self.touched:
+            geom.contype = geom.conaffinity = 0
+        # The floor would hold it back.
+        spec.add_exclude(bodyname1="world", bodyname2=self.name)
+
+
+#: From the door's free edge to the knobs, their height above its lower edge, and their radius, m.
+KNOB_IN, KNOB_UP, KNOB_R = 0.07, 1.0, 0.03
+
+
+@dataclass(frozen=True)
+class Door:
+    """A leaf that turns about the vertical through its hinge; closed it reaches along +Y.
+
+    It has one coordinate, the angle it is open, rad.
+
+    Attributes:
+        name: how the scene calls it.
+        pos: m, the foot of its hinge.
+        width, height, thickness: of the leaf, m.
+        mass: kg.
+        opens: rad, how far to either side.
+        damping: N m s/rad, of the hinge.
+        friction: N m, of the hinge.
+        knob_up: m, of the knobs above the foot of the hinge.
+    """
+
+    name: str = "door"
+    pos: Vector = (1.0, -0.45, 0.0)
+    width: float = 0.9
+    height: float = 2.0
+    thickness: float = 0.04
+    mass: float = 20.0
+    opens: float = 2.0
+    damping: float = 1.0
+    friction: float = 0.5
+    knob_up: float = KNOB_UP
+
+    @property
+    def knob(self) -> Vector:
+        """The front knob's centre, m, in the leaf's frame."""
+        return -(self.thickness / 2 + KNOB_R), self.width - KNOB_IN, self.knob_up
+
+    def __post_init__(self) -> None:
+        sizes = {k: getattr(self, k) for k in ("width", "height", "thickness", "mass", "opens")}
+        above_zero(f"Door '{self.name}'", **sizes)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body with a hinge; the geoms of the knobs are "NAME/knob_front" (toward -X) and
+        "NAME/knob_back"."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
+        body.add_joint(
+            name=self.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1],
+            range=[-self.opens, self.opens], limited=True, damping=[self.damping, 0, 0],
+            frictionloss=self.friction,
+        )  # fmt: skip
+        gap = 0.01
+        half = [self.thickness / 2, self.width / 2, (self.height - gap) / 2]
+        at = [0.0, self.width / 2, gap + half[2]]
+        solid(body, f"{self.name}/leaf", "box", half, pos=at, mass=0.97 * self.mass)
+        for side, sign in (("front", -1.0), ("back", 1.0)):
+            at = [-sign * self.knob[0], *self.knob[1:]]
+            name, share = f"{self.name}/knob_{side}", 0.015 * self.mass
+            solid(body, name, "sphere", [KNOB_R], pos=at, mass=share)
+
+
+@dataclass(frozen=True)
+class Lift:
+    """A plate on a vertical slide, driven toward a height by a spring and a damper.
+
+    It has one coordinate, the height above `pos`, m, and one control, the height wanted.
+
+    Attributes:
+        name: how the scene calls it.
+        size: `(x, y)` m.
+        pos: m, the middle of its upper face at height 0.
+        mass: kg.
+        stiffness: N/m.
+        damping: N s/m.
+        travel: m, how far up and down.
+    """
+
+    name: str = "lift"
+    size: tuple[float, float] = (1.5, 1.5)
+    pos: Vector = (0.0, 0.0, 0.3)
+    mass: float = 20.0
+    stiffness: float = 2e4
+    damping: float = 500.0
+    travel: float = 0.3
+
+    def __post_init__(self) -> None:
+        numbers = {k: getattr(self, k) for k in ("size", "mass", "stiffness", "damping", "travel")}
+        above_zero(f"Lift '{self.name}'", **numbers)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body with a slide and its actuator."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), gravcomp=1.0)
+        body.add_joint(
+            name=self.name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], limited=True,
+            range=[-self.travel, self.travel], damping=[self.damping, 0, 0],
+        )  # fmt: skip
+        half, x, y = 0.02, *self.size
+        at = [0.0, 0.0, -half]
+        solid(body, self.name, "box", [x / 2, y / 2, half], pos=at, mass=self.mass)
+        servo = spec.add_actuator(
+            name=self.name, target=self.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        )  # fmt: skip
+        servo.gainprm[0], servo.biasprm[1] = self.stiffness, -self.stiffness
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A solid with a closed mesh as its surface; contacts see its convex hull.
+
+    Attributes:
+        path: an OBJ or STL file, in metres, Z up.
+        name: how the scene calls it.
+        pos: m, where the file's origin is at first.
+        quat: wxyz, file to world at first.
+        mass: kg; 0 fixes it to the world.
+    """
+
+    path: Path
+    name: str = "mesh"
+    pos: Vector = (0.0, 0.0, 0.0)
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.mass != 0.0:
+            above_zero(f"Mesh '{self.name}'", mass=self.mass)
+        if not Path(self.path).is_file():
+            raise PoiseError("there is no such file", str(self.path))
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds the mesh and one body.
+
+        Raises:
+            PoiseError: a file that MuJoCo cannot read, or a surface that is not closed.
+        """
+        alone = mujoco.MjSpec()
+        alone.add_mesh(name="mesh", file=str(Path(self.path).resolve()))
+        alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+        try:
+            model = alone.compile()
+        except ValueError as problem:
+            text = " ".join(str(problem).split()).removeprefix("Error: ")
+            raise PoiseError(f"the mesh cannot be used: {text}", str(self.path)) from None
+        holes = _open_edges(model.mesh_vert, model.mesh_face)
+        if holes:
+            raise PoiseError(
+                f"the mesh is not closed: {holes} of its edges have no two faces", str(self.path),
+                "Fill its holes, or use a box",
+            )  # fmt: skip
+        spec.add_mesh(name=self.name, file=str(Path(self.path).resolve()))
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), quat=list(self.quat))
+        if self.mass:
+            body.add_freejoint(name=self.name)
+        solid(body, self.name, "mesh", (), meshname=self.name, mass=self.mass)
+
+
+def _open_edges(vertices: np.ndarray, faces: np.ndarray) -> int:
+    """Edges that do not belong to two faces; vertices at one place are one."""
+    _, same = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
+    corners = same.reshape(-1)[faces]
+    edges = np.sort(np.concatenate([corners[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
+    count = Counter(map(tuple, edges.tolist()))
+    return sum(n != 2 for n in count.values())
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A free rod that stands on its lower end and carries a ball on the upper one; one body, with the
+    lower end as its origin. Nothing touches it, so that what it stands on must be a link.
+
+    Attributes:
+        name: how the scene calls it.
+        length: m, from the lower end to the ball's centre.
+        radius: m, of the ball.
+        mass: kg, of the ball; the rod has a tenth of it.
+        pos: m, its lower end at first.
+    """
+
+    name: str = "rod"
+    length: float = 1.0
+    radius: float = 0.08
+    mass: float = 0.5
+    pos: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        sizes = {k: getattr(self, k) for k in ("length", "radius", "mass")}
+        above_zero(f"Rod '{self.name}'", **sizes)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
+        body.add_freejoint(name=self.name)
+        rod, ball = [0.0, 0.0, self.length / 2], [0.0, 0.0, self.length]
+        thin = [0.015, self.length / 2]
+        geoms = (
+            solid(body, f"{self.name}/rod", "capsule", thin, pos=rod, mass=0.1 * self.mass),
+            solid(body, f"{self.name}/ball", "sphere", [self.radius], pos=ball, mass=self.mass),
+        )
+        for geom in geoms:
+            geom.contype = geom.conaffinity = 0
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A free ball.
+
+    Attributes:
+        name: how the scene calls it.
+        radius: m.
+        mass: kg.
+        pos: m, its centre at first.
+    """
+
+    name: str = "ball"
+    radius: float = 0.12
+    mass: float = 0.6
+    pos: Vector = (0.0, 0.0, 0.12)
+
+    def __post_init__(self) -> None:
+        above_zero(f"Ball '{self.name}'", radius=self.radius, mass=self.mass)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
+        body.add_freejoint(name=self.name)
+        solid(body, self.name, "sphere", [self.radius], mass=self.mass)
+
+
+@dataclass(frozen=True)
+class Trampoline:
+    """A plate that a spring and a damper at each corner hold at a height that is its control.
+
+    It has three coordinates, the height above `pos`, m, and its tilts about X and Y, rad, and four
+    controls, the heights wanted of the corners. Its own weight is carried.
+
+    Attributes:
+        name: how the scene calls it.
+        size: `(x, y)` m.
+        pos: m, the middle of its upper face at rest.
+        mass: kg.
+        stiffness: N/m, of each corner.
+        damping: N s/m, of each corner.
+    """
+
+    name: str = "trampoline"
+    size: tuple[float, float] = (2.4, 2.4)
+    pos: Vector = (0.0, 0.0, 0.0)
+    mass: float = 20.0
+    stiffness: float = 4000.0
+    damping: float = 120.0
+
+    def __post_init__(self) -> None:
+        numbers = {k: getattr(self, k) for k in ("size", "mass", "stiffness", "damping")}
+        above_zero(f"Trampoline '{self.name}'", **numbers)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body on a slide and two hinges, and its actuators "NAME/0" to "NAME/3"."""
+        half, (x, y) = 0.02, self.size
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), gravcomp=1.0)
+        for kind, name, axis in (("SLIDE", "z", 2), ("HINGE", "x", 0), ("HINGE", "y", 1)):
+            along = [float(i == axis) for i in range(3)]
+            joint = getattr(mujoco.mjtJoint, f"mjJNT_{kind}")
+            body.add_joint(name=f"{self.name}/{name}", type=joint, axis=along)
+        solid(body, self.name, "box", [x / 2, y / 2, half], pos=[0.0, 0.0, -half], mass=self.mass)
+        for k, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+            name, corner = f"{self.name}/{k}", [sx * x / 2, sy * y / 2, 0.0]
+            body.add_site(name=name, pos=corner)
+            foot = [a + b for a, b in zip(self.pos, corner, strict=True)]
+            spec.worldbody.add_site(name=f"{name}/foot", pos=foot)
+            servo = spec.add_actuator(
+                name=name, target=name, refsite=f"{name}/foot", trntype=mujoco.mjtTrn.mjTRN_SITE,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                gear=[0, 0, 1, 0, 0, 0],
+            )  # fmt: skip
+            servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = (
+                self.stiffness, -self.stiffness, -self.damping,
+            )  # fmt: skip

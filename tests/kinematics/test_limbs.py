@@ -1,0 +1,224 @@
+"""Two bones: laws of triangles, reach, stable bend planes, and clips that keep what is not asked for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import toy_human
+from poise.errors import PoiseError
+from poise.formats import read_clip
+from poise.kinematics import limb_of, match_positions, two_bone
+from poise.kinematics.limbs import soft_reach
+from poise.motion.rotations import (
+    forward_kinematics,
+    frame_quat,
+    normalize,
+    quat_angle,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    shortest_arc,
+)
+
+
+def rand(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def vec(*xyz: float) -> torch.Tensor:
+    return torch.tensor(xyz, dtype=torch.float64)
+
+
+def joints(clip, rot):
+    skeleton = clip.skeleton
+    return forward_kinematics(
+        skeleton.parents, torch.tensor(skeleton.offsets), torch.tensor(clip.root_pos), rot
+    )
+
+
+def test_a_triangle_by_hand():
+    # 3-4-5: the knee lies 9/5 along the line and 12/5 to the side of the pole.
+    got = two_bone(vec(0, 0, 0), vec(5, 0, 0), vec(1, 0, 1), 3.0, 4.0)
+    torch.testing.assert_close(got.mid, vec(1.8, 0, 2.4))
+    torch.testing.assert_close(got.end, vec(5, 0, 0))
+    torch.testing.assert_close(got.normal, vec(0, 1, 0))
+
+
+def test_bones_keep_their_lengths_and_targets_in_reach_are_reached():
+    root, pole = rand(500, 3, seed=1), rand(500, 3, seed=2)
+    l1, l2 = 0.3 + rand(500, seed=3).abs(), 0.3 + rand(500, seed=4).abs()
+    share = torch.rand(500, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    d = (l1 - l2).abs() + share * (0.97 * (l1 + l2) - (l1 - l2).abs())
+    target = root + normalize(rand(500, 3, seed=6)) * d[:, None]
+    got = two_bone(root, target, pole, l1, l2)
+    torch.testing.assert_close((got.mid - root).norm(dim=-1), l1)
+    torch.testing.assert_close((got.end - got.mid).norm(dim=-1), l2)
+    torch.testing.assert_close(got.end, target)
+    across = torch.linalg.cross(got.mid - root, got.end - got.mid)
+    torch.testing.assert_close(normalize(across), got.normal)
+    # The knee lies on the pole's side of the line.
+    along = normalize(target - root)
+    side = got.mid - root - ((got.mid - root) * along).sum(-1, keepdim=True) * along
+    assert bool(((side * pole).sum(-1) > -1e-9).all())
+
+
+def test_out_of_reach_is_approached_softly_and_never_crossed():
+    bone = torch.tensor(0.5, dtype=torch.float64)
+    d = torch.linspace(0.0, 3.0, 3001, dtype=torch.float64)
+    got = soft_reach(d, bone, bone, 0.05)
+    assert float(got.max()) <= 1.0
+    assert bool((got[1:] >= got[:-1] - 1e-15).all())
+    # Slope 1 where it begins, so no corner: the knee's speed does not jump.
+    slope = (got[1:] - got[:-1]) / (d[1:] - d[:-1])
+    assert float((slope[1:] - slope[:-1]).abs().max()) < 0.03
+    torch.testing.assert_close(got[:950], d[:950])
+    assert float(soft_reach(torch.tensor(9.0), bone, bone, 0.0)) == pytest.approx(1.0)
+
+
+def test_a_limb_folds_no_further_than_its_bones_allow():
+    got = two_bone(vec(0, 0, 0), vec(0.05, 0, 0), vec(0, 0, 1), 0.5, 0.3)
+    assert float(got.end.norm()) == pytest.approx(0.2)
+    assert float(got.mid.norm()) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("target", [(0, 0, 0), (0, 0, 0.4)])
+def test_degenerate_targets_and_poles_stay_finite(target):
+    got = two_bone(vec(0, 0, 0), vec(*target), vec(0, 0, 1), 0.3, 0.3)
+    assert all(bool(x.isfinite().all()) for x in got)
+    assert float(got.mid.norm()) == pytest.approx(0.3)
+
+
+def test_the_shortest_arc():
+    a, b = rand(50, 3, seed=7), rand(50, 3, seed=8)
+    q = shortest_arc(a, b)
+    torch.testing.assert_close(normalize(quat_rotate(q, a)), normalize(b))
+    between = torch.acos((normalize(a) * normalize(b)).sum(-1).clamp(-1, 1))
+    torch.testing.assert_close(quat_angle(q), between)
+    half = shortest_arc(vec(0.2, 0, 0), vec(-1, 0, 0))
+    assert float(quat_angle(half)) == pytest.approx(math.pi)
+    torch.testing.assert_close(shortest_arc(vec(0, 0, 0), vec(1, 0, 0)), vec(1, 0, 0, 0))
+
+
+def test_two_frames_of_a_bone_give_its_rotation():
+    q = normalize(rand(20, 4, seed=9))
+    axis, normal = vec(1, 2, 3).expand(20, 3), vec(0, 1, 0).expand(20, 3)
+    now = frame_quat(quat_rotate(q, axis), quat_rotate(q, normal))
+    got = quat_mul(now, quat_conj(frame_quat(axis, normal)))
+    assert float(quat_angle(quat_mul(got, quat_conj(q))).max()) < 1e-7
+
+
+def test_the_limbs_of_a_human():
+    skeleton = toy_human.human()
+    names = [skeleton.names[j] for j in limb_of(skeleton, "LeftFoot")]
+    assert names == ["LeftUpLeg", "LeftLeg", "LeftFoot"]
+    assert skeleton.names[limb_of(skeleton, "RightToe").root] == "RightLeg"
+    with pytest.raises(PoiseError, match="no two bones above"):
+        limb_of(skeleton, "Spine")
+
+
+def test_targets_that_are_already_met_change_nothing():
+    clip = toy_human.swing()
+    rot = torch.tensor(clip.rot)
+    pos, _ = joints(clip, rot)
+    skeleton = clip.skeleton
+    targets = {n: pos[:, skeleton.index(n)] for n in ("LeftFoot", "RightFoot", "LeftHand", "RightHand")}
+    got = match_positions(skeleton, rot, torch.tensor(clip.root_pos), targets)
+    assert float(quat_angle(quat_mul(quat_conj(got), rot)).max()) < 1e-5
+
+
+def test_feet_and_hands_meet_their_targets_and_the_rest_is_kept():
+    clip = toy_human.swing(bend=1.0, speed=1.0)
+    skeleton, rot = clip.skeleton, torch.tensor(clip.rot)
+    pos, quat = joints(clip, rot)
+    foot, hand = skeleton.index("LeftFoot"), skeleton.index("RightHand")
+    goals = {"LeftFoot": pos[:, foot] + vec(0.05, 0.04, 0.1), hand: pos[:, hand] + vec(0.1, 0.0, 0.12)}
+    got = match_positions(skeleton, rot, torch.tensor(clip.root_pos), goals)
+    pos2, quat2 = joints(clip, got)
+    torch.testing.assert_close(pos2[:, foot], goals["LeftFoot"], atol=1e-9, rtol=0)
+    torch.testing.assert_close(pos2[:, hand], goals[hand], atol=1e-9, rtol=0)
+    moved = {skeleton.index(n) for n in ("LeftUpLeg", "LeftLeg", "LeftFoot")}
+    moved |= {skeleton.index(n) for n in ("RightArm", "RightForeArm", "RightHand")}
+    still = [j for j in range(len(skeleton)) if j not in moved]
+    torch.testing.assert_close(got[:, still], rot[:, still])
+    for j in (foot, hand, skeleton.index("LeftToe")):
+        assert float(quat_angle(quat_mul(quat_conj(quat2[:, j]), quat[:, j])).max()) < 1e-6
+    steps = quat_angle(quat_mul(quat_conj(got[:-1]), got[1:]))
+    assert float(steps.max()) < 0.3
+
+
+def test_free_frames_stay():
+    clip = toy_human.swing()
+    skeleton, rot, root = clip.skeleton, torch.tensor(clip.rot), torch.tensor(clip.root_pos)
+    foot = skeleton.index("LeftFoot")
+    pos, _ = joints(clip, rot)
+    goal = pos[:, foot] + vec(0.0, 0.0, 0.1)
+    free = goal.clone()
+    free[:10] = float("nan")
+    a, _ = joints(clip, match_positions(skeleton, rot, root, {foot: free}))
+    torch.testing.assert_close(a[:10, foot], pos[:10, foot])
+    torch.testing.assert_close(a[10:, foot], goal[10:])
+
+
+def test_a_straight_knee_bends_to_its_usual_side():
+    # A leg that is stiff in its middle frames must bend forward there as it does elsewhere.
+    clip = toy_human.swing(seconds=2.0)
+    skeleton, rot = clip.skeleton, torch.tensor(clip.rot)
+    knee, foot = skeleton.index("LeftLeg"), skeleton.index("LeftFoot")
+    angle = 0.6 * torch.cos(torch.linspace(0, math.pi, clip.frames, dtype=torch.float64)).abs()
+    rot[:, knee] = toy_human.turn("Y", angle)
+    pos, _ = joints(clip, rot)
+    lifted = {"LeftFoot": pos[:, foot] + vec(0.0, 0.0, 0.08)}
+    got = match_positions(skeleton, rot, torch.tensor(clip.root_pos), lifted)
+    pos2, _ = joints(clip, got)
+    torch.testing.assert_close(pos2[:, foot], lifted["LeftFoot"], atol=1e-9, rtol=0)
+    assert bool((got[:, knee, 2] > 0.1).all())
+    assert float(quat_angle(quat_mul(quat_conj(got[:-1]), got[1:])).max()) < 0.2
+
+
+@pytest.mark.parametrize("file", ["lafan1_bvh/walk4_subject1.bvh", "cmu_bvh/acrnn_salsa/01.bvh"])
+def test_real_clips_move_by_what_is_asked_without_jumps(data_dir, file):
+    clip = read_clip(data_dir / file)
+    clip = clip.replaced(root_pos=clip.root_pos[:1500], rot=clip.rot[:1500])
+    skeleton, rot, root = clip.skeleton, torch.tensor(clip.rot), torch.tensor(clip.root_pos)
+    pos, _ = joints(clip, rot)
+    ends = [j for j, n in enumerate(skeleton.names) if n.lower().endswith(("foot", "hand"))]
+    assert len(ends) == 4
+    goals = {j: pos[:, j] + vec(0.0, 0.0, 0.05) for j in ends}
+    got = match_positions(skeleton, rot, root, goals)
+    pos2, _ = joints(clip, got)
+    off = np.concatenate([(pos2[:, j] - goals[j]).norm(dim=-1).numpy() for j in ends])
+    # Some arms hang straight and cannot follow; they fall short by less than what was asked.
+    assert np.median(off) < 1e-9 and off.max() < 0.05 + 1e-9
+    before = quat_angle(quat_mul(quat_conj(rot[:-1]), rot[1:])).max(0).values
+    after = quat_angle(quat_mul(quat_conj(got[:-1]), got[1:])).max(0).values
+    assert float((after - before).max()) < 0.35
+    same = match_positions(skeleton, rot, root, {j: pos[:, j] for j in ends})
+    assert float(quat_angle(quat_mul(quat_conj(same), rot)).max()) < 1e-4
+
+
+def test_a_knee_beyond_straight_bends_to_its_usual_side_without_a_jump() -> None:
+    """A knee that is stretched 0 to 12 degrees beyond straight, asked to shorten by 2 cm."""
+    skeleton = toy_human.human()
+    clip = toy_human.swing(1.0)
+    knee, hip, foot = (skeleton.index(f"Left{n}") for n in ("Leg", "UpLeg", "Foot"))
+    root, rot = clip.tensors()
+    count = len(rot)
+    rot = torch.zeros_like(rot)
+    rot[..., 0] = 1.0
+    # Most of the clip bends it the usual way; then it is stretched further and further.
+    angle = torch.full((count,), 0.8, dtype=torch.float64)
+    angle[-14:] = torch.linspace(0.0, -0.21, 14, dtype=torch.float64)
+    rot[:, knee] = toy_human.turn("y", angle)
+    root = root * 0.0
+    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
+    pos = forward_kinematics(skeleton.parents, offsets, root, rot)[0]
+    goal = pos[:, foot] + 0.02 * (pos[:, hip] - pos[:, foot]) / 0.8
+    out = match_positions(skeleton, rot, root, {foot: goal})
+    there = forward_kinematics(skeleton.parents, offsets, root, out)[0]
+    step = there[-13:, knee].diff(dim=0).norm(dim=-1)
+    assert float(step.max()) < 0.03
+    torch.testing.assert_close(there[-14:, foot], goal[-14:], atol=2e-3, rtol=0)
