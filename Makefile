@@ -17,7 +17,7 @@ help:
 	@echo "make check   lint, formatting, types, order of imports"
 	@echo "make format  mend formatting and simple lint"
 	@echo "make bench   measure a walk and a cartwheel again on the CMU clips in DATA=FOLDER"
-	@echo "make docs    check the links of the documents, build their site into site/"
+	@echo "make docs    fill the documents from results/ and the code, check them, build their site into site/"
 	@echo "make clean   remove $(VENV), demo/ and caches"
 
 # The stamps make installing idempotent: it happens again only when what is installed changes.
@@ -64,17 +64,19 @@ format: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/first_light.py --data '$(DATA)'
 
-# The links are checked with Python alone. The site is built where its packages can be installed, in an
-# environment of its own; without network it is left out, which is no failure.
+# Tables and generated pages are filled from results/ and the code. The site is built where its packages can
+# be installed, in an environment of its own; without network it is left out, which is no failure.
 DOCS := $(VENV)/docs
-docs:
-	$(PYTHON) docs/check_links.py
+docs: $(VENV)/.installed
+	$(BIN)/python docs/generate.py
+	$(BIN)/python docs/check_text.py
+	$(BIN)/python docs/check_links.py
 	@if $(DOCS)/bin/mkdocs --version >/dev/null 2>&1 || { $(PYTHON) -m venv $(DOCS) >/dev/null 2>&1 && \
 	    $(DOCS)/bin/python -m pip install --disable-pip-version-check --quiet --retries 1 --timeout 15 \
-	      -c constraints.txt mkdocs mkdocs-material mkdocstrings-python >/dev/null 2>&1; }; then \
+	      -c constraints.txt mkdocs mkdocs-material >/dev/null 2>&1; }; then \
 	  NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet && echo "The site: site/index.html"; \
 	else \
-	  echo "The site was not built: its packages (mkdocs-material, mkdocstrings-python) cannot be installed here."; \
+	  echo "The site was not built: its packages (mkdocs-material) cannot be installed here."; \
 	fi
 
 clean:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
-sys.path.insert(0, str(DOCS))
+sys.path[:0] = [str(DOCS), str(DOCS.parent / "src")]
 
 from tables import TABLES, Results, markdown  # noqa: E402
 

@@ -15,7 +15,8 @@ from types import ModuleType
 import pytest
 
 from poise.errors import PoiseError
-from poise.motion import read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import trim
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -37,7 +37,7 @@ FRAMES = 64
 #: Roles that the docs map, as the embedded walk calls them.
 ROLES = {"left_foot": "LeftFoot"}
 #: `track walk.bvh -o tracked` and what every such command gets.
-_PLAIN = "track walk.bvh -o tracked --characters 8 --threads 1 --budget 40".split()
+_PLAIN = ["track", "walk.bvh", "-o", "tracked", "--characters", "8", "--threads", "1", "--budget", "40"]
 #: Keypoints of a file, and the joints of the embedded walk that they are.
 POINTS = {
     f"{side[0]}{name}": side + joint

@@ -1,42 +1,50 @@
-"""Figures are of the policy that ships, or their page says of which."""
+"""Rows of `results/`: a policy that ships is that of its file, and every row says how it was made."""
 
 from __future__ import annotations
 
-import json
+import csv
+import hashlib
+import re
 from pathlib import Path
 
 import pytest
 
-from poise.jobs.open import open_run
-from poise.papers.compliant.training import digest_of
-
 ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT / "src" / "poise" / "data"
+COLUMNS = ["subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command"]
+SUITES = sorted(f for f in (ROOT / "results").glob("*.csv") if f.stem != "policies")
+POLICY = re.compile(r"([\w-]+-v\d+) ([0-9a-f]{16})")
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8", newline="") as text:
+        return list(csv.DictReader(text))
 
 
 @pytest.fixture(scope="module")
-def digest() -> str:
-    return digest_of(open_run(None).tracker.policy)
+def policies() -> dict[str, dict[str, str]]:
+    return {row["policy"]: row for row in _rows(ROOT / "results" / "policies.csv")}
 
 
-def test_cards_and_their_figures_are_of_what_ships(digest: str) -> None:
-    runs = json.loads((ROOT / "benchmarks/perpetual.json").read_text("utf-8"))["runs"]
-    for name, own in (("tracker", digest), ("keypoints", None)):
-        own = own or digest_of(open_run(name).tracker.policy)
-        card = (ROOT / f"docs/model_cards/{name}.md").read_text("utf-8")
-        assert f"policy `{own}`" in card
-        assert runs[name]["about"]["policy"] == own == runs[f"{name} on Bandai"]["about"]["policy"]
+def test_the_last_policy_of_each_file_is_the_one_that_ships(policies: dict[str, dict[str, str]]) -> None:
+    """`policies.csv` gets a row when another policy comes along, and rows of the one before say so."""
+    latest = {row["file"]: row for row in policies.values()}
+    assert {*latest} == {f.relative_to(DATA).as_posix() for f in DATA.rglob("*.safetensors")}
+    for name, row in latest.items():
+        digest = hashlib.sha256((DATA / name).read_bytes()).hexdigest()[:16]
+        assert row["digest"] == digest, f"{name}: add the policy that ships now to results/policies.csv"
 
 
-def test_compliance_names_the_policy_of_each_figure(digest: str) -> None:
-    """The page names an earlier policy by its millions of control steps."""
-    told = json.loads((ROOT / "benchmarks/compliance.json").read_text("utf-8"))
-    policies, page = told.pop("policies"), (ROOT / "docs/compliance.md").read_text("utf-8")
-    parts: set[str] = set()
-    told.pop("cost")  # of an environment, without a policy
-    for part, rows in told.items():
-        one_by_one = part == "scenes" or part.startswith("throws")
-        parts |= {f"{part}/{name}" for name in rows if name != "episodes"} if one_by_one else {part}
-    assert parts == policies.keys()
-    before = {str(p["million_steps"]) for p in policies.values() if p["digest"] != digest}
-    assert {m for m in before if m in page} == before
-    assert f"{open_run(None).tracker.about['samples'] / 1e6:.1f} million" in page
+@pytest.mark.parametrize("file", SUITES, ids=lambda file: file.stem)
+def test_rows_name_their_policy_and_how_they_were_made(
+    file: Path, policies: dict[str, dict[str, str]]
+) -> None:
+    rows = _rows(file)
+    assert rows and list(rows[0]) == COLUMNS
+    for row in rows:
+        told = f"{file.name}: {row['subject']}, {row['metric']}"
+        assert row["subject"] and row["metric"] and row["command"], told
+        assert row["commit"] or row["policy"] == "published", told
+        float(row["value"])
+        for name, digest in POLICY.findall(row["policy"]):
+            assert policies[name]["digest"] == digest, f"{told}: {name} has another digest"

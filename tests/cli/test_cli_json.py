@@ -27,7 +27,7 @@ KEYS = ("poise", "verb", "ok", "exit_code", "inputs", "outputs", "notes", "resul
 
 
 def check(found: dict[str, Any]) -> None:
-    """The schema of docs/json.md."""
+    """The schema of docs/cli.md."""
     assert tuple(found) == KEYS and found["poise"] == poise.__version__ and found["verb"] in VERBS
     assert isinstance(found["exit_code"], int) and found["ok"] == (found["exit_code"] == 0)
     for path in (*found["inputs"], *found["outputs"].values()):
@@ -122,7 +122,7 @@ def test_numbers_that_are_not_finite_are_null() -> None:
 
 
 def test_the_page_documents_every_key_and_verb() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "json.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "cli.md").read_text("utf-8")
     assert tuple(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)[: len(KEYS)]) == KEYS
     for verb in VERBS:
         assert hasattr(import_module(f"poise.cli.{verb}").Options, "json") and f"`{verb}`" in page

@@ -1,4 +1,4 @@
-"""docs/live-protocol.md: its messages are what the doors take, and nothing is left out."""
+"""docs/live.md: its messages are what the doors take, and nothing is left out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from poise.live.sources import Frame, JsonStream
 from poise.live.stream import Inbox
 from test_docs import ROOT
 
-PAGE = (ROOT / "docs" / "live-protocol.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
 
 
 def messages() -> list[dict[str, Any]]:
@@ -59,7 +59,7 @@ def test_commands_and_reasons_are_all_on_the_page() -> None:
     for kind, fields in COMMANDS.items():
         assert f"`{kind}`" in PAGE, kind
         assert all(f"`{name}`" in PAGE for name in fields), kind
-    rooms = ("commands.py", "stream.py", "points.py", "sources/stream.py", "sources/sockets.py")
+    rooms = ("commands.py", "stream.py", "points.py", "sources.py", "sockets.py")
     for room in rooms:
         text = (ROOT / "src/poise/live" / room).read_text(encoding="utf-8")
         said = re.findall(r'(?:PoiseError\(|refuse\(|return )"([a-z][a-zA-Z -]+)"', text)

@@ -53,7 +53,7 @@ def test_verdicts_are_ordered_and_documented(key):
     worse = t.fair - 1e-6 if t.more else t.fair + 1e-6
     verdicts = [t.verdict(x) for x in (t.good, middle, t.fair, worse, math.nan)]
     assert verdicts == ["good", "fair", "fair", "poor", ""]
-    page = Path(__file__).parents[2] / "docs" / "metrics.md"
+    page = Path(__file__).parents[2] / "docs" / "python.md"
     assert f"| `{key}` | {t.good:g} | {t.fair:g} |" in page.read_text(encoding="utf-8")
 
 
@@ -64,7 +64,7 @@ def test_thresholds_are_frozen():
 
 
 def test_every_key_is_documented():
-    page = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     found = card().to_dict()
     keys = [*found, *(f"help.{k}" for k in found["help"])]
     assert [k for k in keys if k != "help" and f"`{k}`" not in page] == []
