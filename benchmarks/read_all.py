@@ -1,6 +1,6 @@
 """Every motion file of the data set: is it read, is it recognised, how fast, and what is wrong with it.
 
-    python benchmarks/read_all.py --data FOLDER [--only PART] [--out benchmarks/notes/reading.md] [--json FILE.json]
+    python benchmarks/read_all.py --data FOLDER [--only PART] [--out FILE.md] [--json FILE.json]
 
 FOLDER holds `INDEX.tsv` (path, format, joints, fps, frames, ...) and the files that it lists. What the
 index does not tell, the true unit and vertical of each folder, stands in `GROUPS`.
@@ -275,7 +275,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--only", default="", help="only paths that hold this")
-    parser.add_argument("--out", type=Path, default=here.parent / "docs" / "reading.md")
+    parser.add_argument("--out", type=Path, default=here / "notes" / "reading.md")
     parser.add_argument("--json", type=Path, default=here / "read_all.json")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -84,7 +84,7 @@ def _shortened(line: str) -> list[str]:
         if "--seconds" in argv:
             at = argv.index("--seconds")
             del argv[at : at + 2]
-        argv += ["--seconds", "1", "--port", "0"]
+        argv += ["--seconds", "4" if "--record" in argv else "1", "--port", "0"]
     if argv[:2] == ["train", "compliant"]:
         argv += ["--iterations", "1", "--envs", "8", "--ppo.horizon", "4", "--threads", "1"]
     if argv[:2] == ["train", "endless"]:
@@ -94,6 +94,7 @@ def _shortened(line: str) -> list[str]:
     if "--preset" in argv:
         argv += ["--ppo.horizon", "8"]
     if argv[0] == "fleet":
+        argv = ["walk.bvh" if word == "clips" else word for word in argv]
         argv += ["--set", "envs=16", "--set", "iterations=1", "--workers", "2"]
     return argv
 

@@ -175,7 +175,7 @@ def csv_text(clip: Clip, first: int = 0, header: bool = True) -> str:
         "ends": [[j, *tip] for j, tip in skeleton.ends],
     }
     lines = [
-        f"{MARK} {VERSION}",
+        f"{CSV_MARK} {VERSION}",
         f"# name: {json.dumps(clip.name)}",
         f"# fps: {clip.fps!r}",
         f"# cyclic: {json.dumps(clip.cyclic)}",
@@ -244,7 +244,7 @@ def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
     first = decode(lines[0] if lines else b"", path, 1)
     if not first.startswith(CSV_MARK):
         raise PoiseError(
-            f"it is no table of keypoints and no CSV of Poise, which begins with '{MARK} {VERSION}'",
+            f"it is no table of keypoints and no CSV of Poise, which begins with '{CSV_MARK} {VERSION}'",
             path,
             "Name the columns of keypoints NAME_x, NAME_y, NAME_z",
         )

@@ -62,7 +62,7 @@ PAGES = {
     "/live.js": ("live.page", "live.js", "text/javascript; charset=utf-8"),
     "/stage.js": ("live.page", "stage.js", "text/javascript; charset=utf-8"),
     "/live.css": ("live.page", "live.css", "text/css; charset=utf-8"),
-    "/three.js": ("view", "three.min.js", "text/javascript; charset=utf-8"),
+    "/three.js": ("score.report", "three.min.js", "text/javascript; charset=utf-8"),
 }
 DOORS = ("/live", "/bodies", "/stream")
 _POLICY = (
