@@ -67,7 +67,7 @@ def command(*argv: str | Path) -> str:
     # What it was doing stands before its sentence.
     said = " ".join(err.getvalue().split()).rpartition("error: ")[2]
     if code == 2 and "Traceback" not in said:
-        raise PoiseError(said)
+        raise PoiseError(said, code="command-line")
     if code != 0:
         raise RuntimeError(f"exit code {code}: {said[-200:]}")
     return out.getvalue()

@@ -37,12 +37,17 @@ def averaged(
         PoiseError: they are of different characters or networks, or the shares make no mean.
     """
     if min(shares) < 0 or abs(sum(shares) - 1.0) > 1e-6:
-        raise PoiseError(f"shares are no less than 0 and 1 together, not {_words(shares)}")
+        raise PoiseError(
+            f"shares are no less than 0 and 1 together, not {_words(shares)}", code="bad-weights"
+        )
     first = trackers[0]
     mine = first.policy.identity(first.humanoid.identity)
     for k, other in enumerate(trackers[1:], 2):
         if other.policy.identity(other.humanoid.identity) != mine:
-            raise PoiseError(f"policy {k} is of another character or of other networks than the first")
+            raise PoiseError(
+                f"policy {k} is of another character or of other networks than the first",
+                code="bodies-differ",
+            )
     policy = first.policy.copy()
     policy.load_state(_mean([t.policy.state() for t in trackers], shares))
     told = critic or first
@@ -76,7 +81,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parts = [text.rpartition("=") for text in a.policies]
     for text, (name, _, share) in zip(a.policies, parts, strict=True):
         if not (name and share.replace(".", "", 1).isdecimal()):
-            raise PoiseError(f"a policy with its share is POLICY=0.5, not '{text}'")
+            raise PoiseError(
+                f"a policy with its share is POLICY=0.5, not '{text}'", code="option-malformed"
+            )
     trackers = [open_run(name).tracker for name, _, _ in parts]
     critic = open_run(a.critic).tracker if a.critic else None
     save_tracker(averaged(trackers, [float(share) for _, _, share in parts], critic), a.out)

@@ -99,13 +99,21 @@ def _check(options: Options) -> None:
         what = "physics needs the folder of a run" if options.run is None else (
             f"only physics takes a run, got '{options.run}' for {options.what}"
         )  # fmt: skip
-        raise PoiseError(what, hint="Write for example: python benchmarks/engine.py physics result")
+        raise PoiseError(
+            what,
+            hint="Write for example: python benchmarks/engine.py physics result",
+            code="option-needs-option",
+        )
     for name, low in (("envs", 1), ("threads", 0), ("repeats", 1)):
         value = getattr(options, name)
         if value is not None and value < low:
-            raise PoiseError(f"--{name} must be at least {low}, got {value}")
+            raise PoiseError(f"--{name} must be at least {low}, got {value}", code="out-of-range")
     if options.device != "cpu" and options.what not in ("all", "engine"):
-        raise PoiseError(f"{options.what} runs on the CPU alone", hint="Leave --device out")
+        raise PoiseError(
+            f"{options.what} runs on the CPU alone",
+            hint="Leave --device out",
+            code="option-not-applicable",
+        )
     check_device(options.device)
 
 
@@ -114,9 +122,11 @@ def _earlier(path: Path) -> Result:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
-        raise PoiseError(f"cannot be compared with ({problem})", path) from None
+        raise PoiseError(f"cannot be compared with ({problem})", path, code="wrong-file-kind") from None
     if not isinstance(found, dict) or not any(name in found for name in _COMPARED):
-        raise PoiseError("holds no figures of this benchmark", path, "Make it with --json")
+        raise PoiseError(
+            "holds no figures of this benchmark", path, "Make it with --json", code="wrong-file-kind"
+        )
     return found
 
 

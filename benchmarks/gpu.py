@@ -63,10 +63,18 @@ class Options:
 def run(options: Options) -> int:
     """Measures what is not there yet; a part that is measured is written at once."""
     if (options.library is None) != (options.onto is None):
-        raise PoiseError("--library and --onto go together", hint="Give both, or neither of them")
+        raise PoiseError(
+            "--library and --onto go together",
+            hint="Give both, or neither of them",
+            code="option-needs-option",
+        )
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if device == "cpu" and not options.tiny:
-        raise PoiseError("PyTorch finds no CUDA GPU", hint="Try the script without one by --tiny")
+        raise PoiseError(
+            "PyTorch finds no CUDA GPU",
+            hint="Try the script without one by --tiny",
+            code="device-missing",
+        )
     rows, here = _earlier(options.json), machine(device)
     from speed.pieces import TINY, Pieces, Sizes
 
@@ -133,7 +141,9 @@ def _earlier(path: Path) -> list[Row]:
     try:
         return list(json.loads(path.read_text(encoding="utf-8"))["rows"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise PoiseError("holds no figures of this benchmark", path, "Give another file") from None
+        raise PoiseError(
+            "holds no figures of this benchmark", path, "Give another file", code="wrong-file-kind"
+        ) from None
 
 
 def _write(path: Path, rows: list[Row]) -> None:

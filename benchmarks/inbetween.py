@@ -180,7 +180,7 @@ def best_setting(
 ) -> Adaptation:
     """The setting, with its iterations, that scored lowest; `tried` runs `choose_iterations` for one."""
     if not choices:
-        raise PoiseError("there is no setting to choose from")
+        raise PoiseError("there is no setting to choose from", code="argument-missing")
     results = [(config, *tried(config)) for config in choices]
     config, iterations, _ = min(results, key=lambda r: r[2][r[1]])
     return Adaptation(**{**config.__dict__, "iterations": iterations})
@@ -263,7 +263,7 @@ def part_of(task: Task, part: str) -> TestSet:
     protocol = task.config.protocol
     if part == "validation":
         if task.validation is None:
-            raise PoiseError(f"{protocol.name} has no validation part")
+            raise PoiseError(f"{protocol.name} has no validation part", code="none-held-out")
         return task.validation
     std = task.data.std.double()
     return test_set(protocol.split(task.bank, "final"), std, protocol)

@@ -87,7 +87,11 @@ def clips_of(name: str, data: Path | None, library: Path | None, cache: Path) ->
     """
     if name in LIBRARIES:
         if library is None:
-            raise PoiseError(f"the set '{name}' needs --clips FOLDER", hint="See tracker/README.md")
+            raise PoiseError(
+                f"the set '{name}' needs --clips FOLDER",
+                hint="See tracker/README.md",
+                code="option-needs-option",
+            )
         tracker = open_run(None).tracker
         found, _ = library_of(
             library, tracker.example, tracker.config.sim.control_hz, config=LibraryConfig(rates=SIXTY),
@@ -96,13 +100,13 @@ def clips_of(name: str, data: Path | None, library: Path | None, cache: Path) ->
         held = name == "held-out"
         return {c.name: c for c in found if matches(HELD_OUT, c.name, subject_of(c.name)) == held}
     if data is None:
-        raise PoiseError(f"the set '{name}' needs --data FOLDER")
+        raise PoiseError(f"the set '{name}' needs --data FOLDER", code="option-needs-option")
     pattern, without = FILES[name]
     files = [f for f in sorted(data.glob(pattern)) if not any(w in f.as_posix() for w in without)]
     if name == "bandai-test":
         files = [f for f in files if any(w in f.as_posix() for w in KEPT)]
     if not files:
-        raise PoiseError(f"holds no clip of the set '{name}'", data)
+        raise PoiseError(f"holds no clip of the set '{name}'", data, code="no-clips")
     return {f.stem: f for f in files}
 
 
@@ -134,5 +138,7 @@ def budgets_of(texts: Sequence[str]) -> dict[str, LookaheadConfig]:
                 made = LookaheadConfig().with_budget(float(text))
                 out[f"{made.candidates}x{made.horizon}"] = made
         except ValueError:
-            raise PoiseError(f"a budget is COPIESxHORIZON or STEPS, got '{text}'") from None
+            raise PoiseError(
+                f"a budget is COPIESxHORIZON or STEPS, got '{text}'", code="option-malformed"
+            ) from None
     return out

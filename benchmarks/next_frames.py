@@ -59,6 +59,7 @@ class NextFrameConfig:
             raise PoiseError(
                 "past, future, hidden, layers and truth must be at least 1, and own at least 0",
                 "NextFrameConfig",
+                code="out-of-range",
             )
 
     @classmethod
@@ -205,6 +206,7 @@ class NextFrames:
             raise PoiseError(
                 f"seeds must be pasts of {net.config.past} frames, got {tuple(seeds.shape)}",
                 "NextFrames",
+                code="wrong-shape",
             )
         self.net, self.seeds, self.fps, self.bounds = net.eval(), seeds.double(), fps, bounds
         self.past, self.future = net.config.past, net.config.future

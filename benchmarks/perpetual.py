@@ -202,7 +202,9 @@ def write_card(runs: Mapping[str, Any], a: argparse.Namespace) -> None:
     """The model card of one run, with its learning curves beside it."""
     name = a.card_of or next(iter(runs))
     if name not in runs:
-        raise PoiseError(f"there is no run '{name}'", hint=f"Measured are {', '.join(runs)}")
+        raise PoiseError(
+            f"there is no run '{name}'", hint=f"Measured are {', '.join(runs)}", code="unknown-choice"
+        )
     image = a.card.with_suffix(".svg")
     a.card.parent.mkdir(parents=True, exist_ok=True)
     drawn = "curves" in runs[name]
@@ -246,7 +248,7 @@ def arguments() -> argparse.ArgumentParser:
 def _licences(texts: list[str]) -> Mapping[str, str]:
     parts = [t.partition("=") for t in texts]
     if bad := [t for t, (_, equals, said) in zip(texts, parts, strict=True) if not (equals and said)]:
-        raise PoiseError(f"--licence needs DATA=TEXT, got '{bad[0]}'")
+        raise PoiseError(f"--licence needs DATA=TEXT, got '{bad[0]}'", code="option-malformed")
     return {data.strip(): said.strip() for data, _, said in parts}
 
 

@@ -36,7 +36,7 @@ def read_curve(folder: Path) -> dict[str, Any]:
     """
     path = folder / "log.csv"
     if not path.exists():
-        raise PoiseError("there is no log of the training", path)
+        raise PoiseError("there is no log of the training", path, code="file-missing")
     with path.open(newline="", encoding="utf-8") as file:
         lines = [r for r in csv.DictReader(file) if None not in r.values()]
     told = _evaluated(folder)

@@ -64,7 +64,7 @@ class Run:
         if not (folder / RUN_FILE).exists():
             folder = folder / "run"
         if not (folder / RUN_FILE).exists():
-            raise PoiseError(f"is no run folder: there is no {RUN_FILE} in it", folder)
+            raise PoiseError(f"is no run folder: there is no {RUN_FILE} in it", folder, code="not-a-run")
         run = open_run(folder)
         owner = None
         if (folder / LATEST).exists():
@@ -140,10 +140,12 @@ def held_out(
     seen = {c.name: twin for c in clips if (twin := _learned(run, c)) is not None}
     if patterns and seen:
         name, twin = next(iter(seen.items()))
-        raise PoiseError(f"'{name}' was learned, as '{twin}'; it cannot be held out", folder)
+        raise PoiseError(
+            f"'{name}' was learned, as '{twin}'; it cannot be held out", folder, code="clip-was-learned"
+        )
     clips = [c for c in clips if c.name not in seen]
     if not clips:
-        raise PoiseError("holds no clip that was held out of the training", folder)
+        raise PoiseError("holds no clip that was held out of the training", folder, code="none-held-out")
     both = sorted({*subjects([c.name for c in clips])} & {*subjects(run.imitation.library.names)})
     notes = list(report.sentences())
     if both:

@@ -168,9 +168,11 @@ def read_field_table(path: str | Path) -> FieldTable:
     try:
         return FieldTable.from_dict(json.loads(Path(path).read_bytes()))
     except OSError as problem:
-        raise PoiseError(f"cannot be read: {problem.strerror}", path) from None
+        raise PoiseError(f"cannot be read: {problem.strerror}", path, code="file-unreadable") from None
     except (ValueError, KeyError, TypeError):
-        raise PoiseError("is no field table", path, "Evaluate the policy again") from None
+        raise PoiseError(
+            "is no field table", path, "Evaluate the policy again", code="wrong-file-kind"
+        ) from None
 
 
 def _line(cells: Sequence[object]) -> str:

@@ -34,7 +34,9 @@ def model_card(
         PoiseError: no results of a run.
     """
     if "about" not in parts:
-        raise PoiseError("a model card needs the results of a run", hint="Measure it first")
+        raise PoiseError(
+            "a model card needs the results of a run", hint="Measure it first", code="argument-missing"
+        )
     about = parts["about"]
     sections = [
         [f"# {title}"],

@@ -56,9 +56,12 @@ def field_table(
     parts = [rollouts] if isinstance(rollouts, RolloutSet) else rollouts
     gathered = [_Part.of(r, chosen, bodies) for r in parts]
     if not gathered:
-        raise PoiseError("there is no episode to tabulate")
+        raise PoiseError("there is no episode to tabulate", code="no-rollouts")
     if len({p.fps for p in gathered}) > 1:
-        raise PoiseError(f"the rollouts have several frame rates: {sorted({p.fps for p in gathered})}")
+        raise PoiseError(
+            f"the rollouts have several frame rates: {sorted({p.fps for p in gathered})}",
+            code="rate-differs",
+        )
     names = [n for p in gathered for n in p.names]
     won, count, failed_at, start = (
         torch.cat([getattr(p, k) for p in gathered]) for k in ("won", "frames", "failed_at", "start")
@@ -107,7 +110,9 @@ class _Part:
         mask[:, 0] = uncut[:, 0] = False
         picked = list(range(r.pos.shape[2]) if bodies is None else bodies)
         if r.root not in picked:
-            raise PoiseError(f"the bodies of a tracking table must hold the root, body {r.root}")
+            raise PoiseError(
+                f"the bodies of a tracking table must hold the root, body {r.root}", code="joint-missing"
+            )
         ref = r.ref_pos[:, :, picked].double()
         # Frames that do not count may hold anything, on which Procrustes would stop.
         pos = torch.where(uncut[..., None, None], r.pos[:, :, picked].double(), ref)

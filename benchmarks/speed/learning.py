@@ -80,7 +80,9 @@ def bench_labels(
     The first of its lessons warms up. A repeat is one lesson, of `config.decisions` of each world.
     """
     if tracker.value is None:
-        raise PoiseError("the policy was saved without its critic, which lookahead needs")
+        raise PoiseError(
+            "the policy was saved without its critic, which lookahead needs", code="critic-missing"
+        )
     policy = tracker.policy.copy().to(networks)
     value = Value(policy, tracker.value.state(), tracker.config.ppo.activation)
     value.critic.to(networks)

@@ -64,6 +64,7 @@ def relaxed_stance(humanoid: Humanoid) -> Stance:
             f"no pose within the joint ranges stands: the soles tilt by {best.tilt_deg:.0f} degrees and "
             f"the centre of mass lies {best.margin_m * 1000:+.0f} mm inside their edge",
             hint="Widen the ranges of the hips, knees and ankles",
+            code="no-stance",
         )
     return best
 
@@ -76,7 +77,7 @@ def support_polygon(points: np.ndarray) -> np.ndarray:
     try:
         return points[ConvexHull(points).vertices]
     except QhullError:
-        raise PoiseError("the soles span no area to stand on") from None
+        raise PoiseError("the soles span no area to stand on", code="no-stance") from None
 
 
 def polygon_margin(point: np.ndarray, polygon: np.ndarray) -> float:
@@ -98,7 +99,7 @@ def sole_corners(row: BodyRow) -> np.ndarray:
         turn = quat_to_matrix(torch.tensor(geom.quat, dtype=torch.float64)).numpy()
         out.append(face @ turn.T + np.array(geom.pos))
     if not out:
-        raise PoiseError(f"the foot '{row.name}' has no box to stand on")
+        raise PoiseError(f"the foot '{row.name}' has no box to stand on", code="no-stance")
     return np.concatenate(out)
 
 
@@ -114,7 +115,7 @@ class _Solver:
         self.height, self.arms_out = humanoid.table.height_m, math.radians(ARMS_OUT[0])
         self.feet = {self.rows[i].side: i for i in humanoid.feet}
         if set(self.feet) != {"left", "right"}:
-            raise PoiseError("the body needs a left and a right foot to stand")
+            raise PoiseError("the body needs a left and a right foot to stand", code="no-stance")
         self.corners = {side: sole_corners(self.rows[i]) for side, i in self.feet.items()}
         boxes = {s: next(g for g in self.rows[i].geoms if g.kind == "box") for s, i in self.feet.items()}
         self.soles = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class PoiseError(Exception):
@@ -12,12 +13,27 @@ class PoiseError(Exception):
         what: what was wrong, with the value that was got.
         where: file, file and line, joint or frame, as a prefix ("walk.bvh, line 12").
         hint: what to do about it.
+        code: the kind of mistake, for programs, such as "file-missing" or "out-of-range". A kind has one
+            code wherever it is met, and keeps it when the sentence changes.
     """
 
-    def __init__(self, what: str, where: str | Path | None = None, hint: str | None = None):
+    def __init__(
+        self, what: str, where: str | Path | None = None, hint: str | None = None, *, code: str
+    ):
         self.what, self.where, self.hint = what, None if where is None else str(where), hint
+        self.code = code
         text = what if where is None else f"{where}: {what}"
         super().__init__(text if hint is None else f"{text.rstrip('.')}. {hint}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles take the error as it is, since `args` holds its sentence alone."""
+        return _again, (type(self), self.args, self.__dict__)
+
+
+def _again(kind: type[PoiseError], args: tuple[Any, ...], state: dict[str, Any]) -> PoiseError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(state)
+    return error
 
 
 def did_you_mean(name: str, known: list[str] | tuple[str, ...]) -> str:
@@ -58,7 +74,7 @@ def brief(error: PoiseError, path: Path) -> PoiseError:
     most = _MOST - len(place) - 4
     what = _cut(error.what, most - 60 if error.hint else most)
     hint = None if error.hint is None else _cut(error.hint, most - len(what))
-    return PoiseError(what, where + place, hint)
+    return PoiseError(what, where + place, hint, code=error.code)
 
 
 def _cut(text: str, most: int) -> str:

@@ -118,10 +118,17 @@ def validate(config: Any) -> None:
         if known and value not in known:
             texts = [str(k) for k in known]
             raise PoiseError(
-                f"{f.name} cannot be {_short(value)}", name, did_you_mean(str(value)[:40], texts)
+                f"{f.name} cannot be {_short(value)}",
+                name,
+                did_you_mean(str(value)[:40], texts),
+                code="unknown-choice",
             )
         if f.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
-            raise PoiseError(f"seed must be a whole number from 0 to 2**63 - 1, got {value!r}", name)
+            raise PoiseError(
+                f"seed must be a whole number from 0 to 2**63 - 1, got {value!r}",
+                name,
+                code="out-of-range",
+            )
 
 
 def changed(config: T, settings: Mapping[str, Any]) -> T:
@@ -134,7 +141,9 @@ def changed(config: T, settings: Mapping[str, Any]) -> T:
     for name in settings:
         if name not in known:
             what = f"there is no setting '{name}'"
-            raise PoiseError(what, type(config).__name__, did_you_mean(name, known))
+            raise PoiseError(
+                what, type(config).__name__, did_you_mean(name, known), code="unknown-setting"
+            )
     return dataclasses.replace(config, **settings)  # type: ignore[type-var]
 
 
@@ -157,12 +166,12 @@ def check_data(kind: type, data: Any, where: Path | str | None = None, name: str
     """
     if not isinstance(data, Mapping):
         what = name or "what it says of itself"
-        raise PoiseError(f"{what} must be a table, got {_short(data)}", where)
+        raise PoiseError(f"{what} must be a table, got {_short(data)}", where, code="wrong-type")
     inside = f" in {name}" if name else ""
     missing = sorted(k for k in getattr(kind, "__required_keys__", ()) if k not in data)
     if missing:
         hint = "The file is damaged, or of another kind"
-        raise PoiseError(f"'{missing[0]}' is missing{inside}", where, hint)
+        raise PoiseError(f"'{missing[0]}' is missing{inside}", where, hint, code="key-missing")
     for key, one in _types(kind).items():
         if key in data:
             _value(one, data[key], f"{name}.{key}" if name else key, where)
@@ -184,10 +193,12 @@ def from_toml(kind: type[T], path: Path, verb: str = "") -> T:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as problem:
-        raise PoiseError(f"cannot be read ({(problem.strerror or '').lower()})", path) from None
+        raise PoiseError(
+            f"cannot be read ({(problem.strerror or '').lower()})", path, code="file-unreadable"
+        ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
         hint = f"poise {verb} --print-config shows one that is complete" if verb else ""
-        raise PoiseError(f"is no TOML ({problem})", path, hint) from None
+        raise PoiseError(f"is no TOML ({problem})", path, hint, code="bad-toml") from None
     return from_data(kind, data, path)
 
 
@@ -199,19 +210,28 @@ def _types(kind: type) -> dict[str, Any]:
 def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:
     if not _is_table(data):
         what = name or "the settings"
-        raise PoiseError(f"{what} must be a table of settings, got {_short(data)}", where)
+        raise PoiseError(
+            f"{what} must be a table of settings, got {_short(data)}", where, code="wrong-type"
+        )
     types = {f.name: _types(kind)[f.name] for f in fields(kind) if f.init}
     unknown = [k for k in data if k not in types]
     if unknown:
         near = did_you_mean(str(unknown[0]), list(types)) or f"Known: {', '.join(types)}"
         whole = f"{name}.{unknown[0]}" if name else str(unknown[0])
-        raise PoiseError(f"there is no setting '{whole}' in this version of Poise", where, near)
+        raise PoiseError(
+            f"there is no setting '{whole}' in this version of Poise",
+            where,
+            near,
+            code="unknown-setting",
+        )
     values = {k: _value(types[k], v, f"{name}.{k}" if name else k, where) for k, v in data.items()}
     try:
         return kind(**values)
     except PoiseError as problem:
         # What the settings refuse by themselves is told with the file.
-        raise PoiseError(problem.what, problem.where if where is None else where, problem.hint) from None
+        raise PoiseError(
+            problem.what, problem.where if where is None else where, problem.hint, code=problem.code
+        ) from None
 
 
 def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
@@ -230,7 +250,9 @@ def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
     if origin is Literal:
         if value not in args:
             known = ", ".join(f"'{a}'" for a in args)
-            raise PoiseError(f"{name} must be one of {known}, got {value!r}", where)
+            raise PoiseError(
+                f"{name} must be one of {known}, got {value!r}", where, code="unknown-choice"
+            )
         return value
     if is_dataclass(kind):
         return _made(kind, value, name, where)
@@ -243,14 +265,16 @@ def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
     if origin is tuple and _is_list(value):
         kinds = args[:1] * len(value) if len(args) == 2 and args[1] is ... else args
         if len(kinds) != len(value):
-            raise PoiseError(f"{name} must have {len(kinds)} values, got {len(value)}", where)
+            raise PoiseError(
+                f"{name} must have {len(kinds)} values, got {len(value)}", where, code="count-differs"
+            )
         pairs = enumerate(zip(kinds, value, strict=True))
         return tuple(_value(k, v, f"{name}[{i}]", where) for i, (k, v) in pairs)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return value
     plain = origin or kind
     if not isinstance(value, plain) or (isinstance(value, bool) and plain is not bool):
-        raise PoiseError(f"{name} must be {_words(kind)}, got {_short(value)}", where)
+        raise PoiseError(f"{name} must be {_words(kind)}, got {_short(value)}", where, code="wrong-type")
     return value
 
 

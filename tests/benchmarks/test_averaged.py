@@ -9,10 +9,10 @@ import averaged
 import pytest
 import torch
 
-from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn.policy import Value
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -67,18 +67,18 @@ def test_the_command_writes_a_policy(both: tuple[Tracker, Tracker], tmp_path: Pa
 def test_shares_that_make_no_mean_are_refused(
     both: tuple[Tracker, Tracker], shares: tuple[float, float]
 ) -> None:
-    with pytest.raises(PoiseError, match="1 together"):
+    with refused("bad-weights"):
         averaged.averaged(both, shares)
 
 
 def test_another_character_is_refused(both: tuple[Tracker, Tracker]) -> None:
     first, other = both
     narrow = replace(other, policy=other.policy.with_actions(3))
-    with pytest.raises(PoiseError, match="policy 2 is of another character"):
+    with refused("bodies-differ", says="2"):
         averaged.averaged((first, narrow), (0.5, 0.5))
 
 
 @pytest.mark.parametrize("text", ["policy.safetensors", "policy.safetensors=half", "=0.5"])
 def test_a_policy_without_its_share_is_refused(text: str) -> None:
-    with pytest.raises(PoiseError, match="with its share is"):
+    with refused("option-malformed"):
         averaged.main([text, "-o", "out.safetensors"])

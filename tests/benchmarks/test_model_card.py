@@ -5,10 +5,9 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
-import pytest
 from field.model_card import model_card
 
-from poise.errors import PoiseError
+from refusals import refused
 
 ABOUT: dict[str, Any] = {
     "clips": 12, "minutes_of_motion": 3.5, "subjects": ["cmu 02", "cmu 07"], "stage": "composer",
@@ -74,7 +73,7 @@ def test_what_is_missing_is_named() -> None:
     ):  # fmt: skip
         assert words in said, words
     assert "Learning curves" not in said
-    with pytest.raises(PoiseError, match="needs the results of a run"):
+    with refused("argument-missing"):
         model_card({})
 
 

@@ -14,11 +14,11 @@ from field.recovery import recovery_markdown
 from poise.control import PDTargets
 from poise.env import Recovery, TaskConfig
 from poise.env.recovery.falls import Drop
-from poise.errors import PoiseError
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.score import recovery_card, trial_task
 from poise.score.recovered import KINDS, back_after
+from refusals import refused
 from toy_human import swing
 
 
@@ -118,12 +118,12 @@ def test_what_cannot_be_tried_is_told(built):
     def make(n: int):
         return built.env(n, 0, False, threads=1)
 
-    with pytest.raises(PoiseError, match="no fail-state 'lost'"):
+    with refused("unknown-fall-state", says="lost"):
         recovery_card(make, Still(1), kinds=("lost",))
-    with pytest.raises(PoiseError, match="no clip 3"):
+    with refused("index-outside", says="3"):
         recovery_card(make, Still(1), 2, clip=3)
     plain = replace(built, task=replace(built.task, recovery=None))
-    with pytest.raises(PoiseError, match="none for trials"):
+    with refused("task-unfit"):
         recovery_card(lambda n: plain.env(n, 0, False, threads=1), Still(1), 2)
 
 

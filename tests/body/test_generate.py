@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from poise.body import BodyConfig, Humanoid, generate_table, make_humanoid
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.kinematics import Kinematics, contact_labels, fit_humanoid, lowest_height
 from poise.motion import Clip, trim
 from poise.motion.rotations import quat_rotate
 from poise.sim import alone
+from refusals import refused
 from toy_human import human, swing
 
 #: Short real clips of every dialect, the ASF of those that need one, hinges and bodies.
@@ -165,26 +165,25 @@ def test_overrides_by_body_and_by_part():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"LeftFoto.kp": 1.0}, "no body 'LeftFoto'. Did you mean 'LeftFoot'?"),
-        ({"LeftFoot.colour": 1.0}, "'LeftFoot.colour' is no parameter of a body"),
-        ({"kp": 1.0}, "'kp' is no parameter of a body"),
-        ({"LeftFoot.kp": -1.0}, "must be a number of at least 0, got -1.0"),
-        ({"LeftFoot.kp": math.nan}, "must be a number of at least 0, got nan"),
+        ({"LeftFoto.kp": 1.0}, ("unknown-body", ("LeftFoto", "LeftFoot"))),
+        ({"LeftFoot.colour": 1.0}, ("unknown-setting", "LeftFoot.colour")),
+        ({"kp": 1.0}, ("unknown-setting", "kp")),
+        ({"LeftFoot.kp": -1.0}, ("out-of-range", "-1.0")),
+        ({"LeftFoot.kp": math.nan}, ("out-of-range", "nan")),
     ],
 )
 def test_wrong_overrides_are_told(changes, message):
-    with pytest.raises(PoiseError) as error:
+    with refused(*message):
         generate_table(human()).overridden(changes)
-    assert message in str(error.value)
 
 
 def test_wrong_settings_and_skeletons_are_told():
-    with pytest.raises(PoiseError, match=r"between 2 and 5000 kg, got 0\.5"):
+    with refused("out-of-range", says="0.5"):
         BodyConfig(mass_kg=0.5)
-    with pytest.raises(PoiseError, match="preset must be auto, cmu-rfc or generic"):
+    with refused("unknown-choice", says="preset"):
         BodyConfig(preset="robot")
     flat = replace(human(), offsets=np.zeros((len(human()), 3)))
-    with pytest.raises(PoiseError, match=r"the legs are 0\.0 mm long"):
+    with refused("limb-too-short", says="0.0"):
         generate_table(flat)
 
 
@@ -196,7 +195,7 @@ def test_rows_out_of_order_are_refused():
     later = replace(rows[arm], name="Extra", geoms=rows[arm].geoms)
     rest = (replace(r, parent=r.parent + (r.parent > arm)) for r in rows[fore:])
     moved = (*rows[: arm + 1], later, *rest)
-    with pytest.raises(PoiseError, match="Order the rows depth first"):
+    with refused("body-table-order"):
         make_humanoid(human(), replace(table, rows=moved, contact_exclusions=()))
 
 

@@ -9,9 +9,9 @@ import torch
 from speed.stance import relaxed_stance
 
 from poise.body import BodyConfig, make_humanoid, read_mjcf
-from poise.errors import PoiseError
 from poise.kinematics import Kinematics, fit_humanoid
 from poise.recipes.residual_force import ResidualForce, build
+from refusals import refused
 from rigs import rig
 
 
@@ -143,37 +143,37 @@ def test_it_stands_and_takes_a_clip_of_another_skeleton(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (mjcf(root=""), "it has no free root. Give the pelvis a <freejoint/>"),
+        (mjcf(root=""), ("no-free-root",)),
         (
             mjcf(elbow="ball").replace('range="-140 5"', ""),
-            "'left_elbow' of body 'left_forearm' is a ball joint",
+            ("joint-unsupported", ("left_elbow", "left_forearm", "ball")),
         ),
-        (mjcf(elbow="slide"), "'left_elbow' of body 'left_forearm' is a slide joint"),
-        (mjcf(foot_axis="1 1 0"), "the hinges of body 'left_foot' are 45 degrees off right angles"),
-        (mjcf().replace("</worldbody>", "</worldbdy>"), "MuJoCo cannot read it"),
-        (mjcf().replace('kp="700"', 'kp="many"'), "line"),
-        (BALL, "no left foot was found among the joints ball."),
+        (mjcf(elbow="slide"), ("joint-unsupported", ("left_elbow", "left_forearm", "slide"))),
+        (mjcf(foot_axis="1 1 0"), ("joint-unsupported", ("left_foot", "45"))),
+        (mjcf().replace("</worldbody>", "</worldbdy>"), ("mjcf-unreadable",)),
+        (mjcf().replace('kp="700"', 'kp="many"'), ("mjcf-unreadable", "line")),
+        (BALL, ("role-missing", ("left foot", "ball"))),
         (
             mjcf(more='<body><geom type="mesh" mesh="m"/></body>').replace(
                 "<worldbody>", '<asset><mesh name="m" file="gone.stl"/></asset><worldbody>'
             ),
-            "gone.stl",
+            ("mjcf-unreadable", "gone.stl"),
         ),
     ],
     ids=["no-free", "ball", "slide", "skew", "xml", "line", "no-foot", "mesh"],
 )
 def test_what_does_not_fit_is_told_in_a_sentence(tmp_path, text, message):
     path = written(tmp_path, text)
-    with pytest.raises(PoiseError) as error:
+    with refused(*message) as error:
         read_mjcf(path)
-    assert message in str(error.value) and str(path) in str(error.value)
+    assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_missing_file_and_two_masses_are_told(tmp_path):
-    with pytest.raises(PoiseError, match="there is no such file"):
+    with refused("file-missing"):
         read_mjcf(tmp_path / "none.xml")
-    with pytest.raises(PoiseError, match="has its own mass"):
+    with refused("settings-conflict"):
         BodyConfig(mass_kg=70.0, mjcf="own.xml")
 
 
@@ -207,28 +207,28 @@ BOMB = '<texture name="t" type="2d" builtin="flat" width="60000" height="60000"/
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (above('<include file="../x.xml"/>'), "a file outside its folder"),
-        (above('<include file="/etc/passwd"/>'), "a file outside its folder"),
-        (asset('<mesh name="m" file="../../m.stl"/>'), "a file outside its folder ('../../m.stl')"),
-        (above('<extension><plugin plugin="x"/></extension>'), "plug-ins"),
-        (asset(BOMB), "its <texture> makes 3.6e+09 with width and height, more than"),
-        (asset('<hfield nrow="40000" ncol="40000" size="1 1 1 1"/>'), "its <hfield> makes 1.6e+09"),
-        (above('<size nuserdata="2000000000"/>'), "its <size> makes"),
-        (above('<size nkey="2000000000"/>'), "its <size> makes"),
-        (mjcf(more='<replicate count="100000"><body/></replicate>'), "its <replicate> makes 1e+05 with"),
-        (mjcf(more='<flexcomp type="grid" count="300 300 300"/>'), "its <flexcomp> makes 2.7e+07"),
-        (mjcf(more="<body>" * 300 + "</body>" * 300), "more than 200 deep"),
-        ('<!DOCTYPE a [<!ENTITY x "y">]>' + mjcf(), "it declares entities"),
-        ("", "the file is empty"),
-        ("<mujoco>" + "<geom/>" * 50_001 + "</mujoco>", "more than 50000 elements"),
+        (above('<include file="../x.xml"/>'), ("outside-folder",)),
+        (above('<include file="/etc/passwd"/>'), ("outside-folder",)),
+        (asset('<mesh name="m" file="../../m.stl"/>'), ("outside-folder", "../../m.stl")),
+        (above('<extension><plugin plugin="x"/></extension>'), ("content-refused",)),
+        (asset(BOMB), ("over-limit", ("<texture>", "3.6e+09"))),
+        (asset('<hfield nrow="40000" ncol="40000" size="1 1 1 1"/>'), ("over-limit", "1.6e+09")),
+        (above('<size nuserdata="2000000000"/>'), ("over-limit", "<size>")),
+        (above('<size nkey="2000000000"/>'), ("over-limit", "<size>")),
+        (mjcf(more='<replicate count="100000"><body/></replicate>'), ("over-limit", "1e+05")),
+        (mjcf(more='<flexcomp type="grid" count="300 300 300"/>'), ("over-limit", "2.7e+07")),
+        (mjcf(more="<body>" * 300 + "</body>" * 300), ("nested-too-deep", "200")),
+        ('<!DOCTYPE a [<!ENTITY x "y">]>' + mjcf(), ("content-refused",)),
+        ("", ("file-empty",)),
+        ("<mujoco>" + "<geom/>" * 50_001 + "</mujoco>", ("over-limit", "50000")),
     ],
 )  # fmt: skip
 def test_files_from_strangers_are_limited(tmp_path, text, message):
     path = written(tmp_path, text)
-    with pytest.raises(PoiseError) as error:
+    with refused(*message) as error:
         read_mjcf(path)
     said = str(error.value)
-    assert message in said and said.startswith(str(path)) and len(said) < len(str(path)) + 200
+    assert said.startswith(str(path)) and len(said) < len(str(path)) + 200
 
 
 def test_what_lies_in_its_folder_is_included(tmp_path):

@@ -142,11 +142,11 @@ def test_claimed_leaves_no_folder_after_a_failure(tmp_path: Path) -> None:
     deep = tmp_path / "a" / "b"
     with pytest.raises(PoiseError), claimed(deep):
         assert deep.is_dir()
-        raise PoiseError("no")
+        raise PoiseError("no", code="internal-fault")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(PoiseError), claimed(deep):
         (deep / "kept").touch()
-        raise PoiseError("no")
+        raise PoiseError("no", code="internal-fault")
     assert (deep / "kept").exists()
     with claimed(deep):
         pass

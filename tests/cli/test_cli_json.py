@@ -34,7 +34,8 @@ def check(found: dict[str, Any]) -> None:
         assert isinstance(path, str) and Path(path).exists()
     assert all(isinstance(n, str) for n in found["notes"]) and all(map(str.isidentifier, KEYS))
     if found["error"] is not None:
-        assert tuple(found["error"]) == ("what", "where", "hint") and found["error"]["what"]
+        assert tuple(found["error"]) == ("code", "what", "where", "hint") and found["error"]["what"]
+        assert re.fullmatch(r"[a-z]+(-[a-z]+)*", found["error"]["code"])
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,8 @@ def test_faults_and_unknown_verbs(
     short: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, answered
 ) -> None:
     assert main(["trak", "--json"]) == 2
-    assert "there is no command 'trak'" in json.loads(capsys.readouterr().out)["error"]["what"]
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "unknown-verb" and "'trak'" in error["what"]
 
     def broken(*_: object, **__: object) -> None:
         print("a library prints")
@@ -113,12 +115,12 @@ def test_faults_and_unknown_verbs(
 
     monkeypatch.setattr("poise.formats.read_clip", broken)
     found = answered("info", short, code=1)
-    assert "ZeroDivisionError" in found["error"]["what"] and "fault of Poise" in found["error"]["hint"]
+    assert "ZeroDivisionError" in found["error"]["what"] and found["error"]["code"] == "internal-fault"
 
 
 def test_numbers_that_are_not_finite_are_null() -> None:
     assert plain({"a": (float("nan"), Path("x"), [float("inf"), 1])}) == {"a": [None, "x", [None, 1]]}
-    check(document("info", [], Answer(exit_code=2), PoiseError("wrong", "here")))
+    check(document("info", [], Answer(exit_code=2), PoiseError("wrong", "here", code="wrong-type")))
 
 
 def test_the_page_documents_every_key_and_verb() -> None:

@@ -19,6 +19,7 @@ from poise.jobs.track import TrackConfig
 from poise.motion import trim
 from poise.plan import LookaheadConfig, SamplingConfig
 from poise.score.card import Help
+from refusals import refused
 from toy_policy import WALK, toy_run
 
 
@@ -88,7 +89,7 @@ def test_python_does_the_same(run: Path, short: Path, tmp_path: Path) -> None:
     assert made.clip.skeleton.names == read_clip(short).skeleton.names
     paths = made.save(tmp_path / "made")
     assert paths["report"].exists() and (paths["run"] / "run.safetensors").exists()
-    with pytest.raises(poise.PoiseError, match="learned from nothing, and a policy was given"):
+    with refused("settings-conflict"):
         poise.imitate(short, policy=run, help_limit=50.0)
 
 

@@ -20,6 +20,7 @@ from poise.cli.info import KEYS
 from poise.cli.main import VERBS, main
 from poise.cli.options import override
 from poise.errors import PoiseError
+from refusals import refused
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
 #: Set to write the help texts anew.
@@ -247,7 +248,7 @@ def test_eval_writes_rollouts(trained: Path, tmp_path: Path, answered, refused) 
 def test_overrides_are_name_and_number() -> None:
     assert override("lfoot.kp=4e2") == ("lfoot.kp", 400.0)
     for text in ("lfoot.kp", "=3", "lfoot.kp=much"):
-        with pytest.raises(PoiseError, match="--set"):
+        with refused("option-malformed", says="--set"):
             override(text)
 
 

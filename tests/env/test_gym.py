@@ -6,12 +6,11 @@ import warnings
 
 import gymnasium
 import numpy as np
-import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from poise.env import GymEnv, GymVectorEnv
-from poise.errors import PoiseError
+from refusals import refused
 
 
 def test_single_env_passes_gymnasiums_checker(make_env):
@@ -122,12 +121,12 @@ def test_gymnasium_vector_wrappers_apply(make_env):
 
 def test_mistakes_are_told(make_env):
     env = make_env(2, auto_reset=False)
-    with pytest.raises(PoiseError, match="auto_reset"):
+    with refused("auto-reset-needed"):
         GymVectorEnv(env)
-    with pytest.raises(PoiseError, match="one world"):
+    with refused("single-world-needed"):
         GymEnv(env)
     env.close()
     env = make_env(2)
-    with pytest.raises(PoiseError, match="limit must be above 0"):
+    with refused("out-of-range", says="limit"):
         GymVectorEnv(env, limit=0.0)
     env.close()

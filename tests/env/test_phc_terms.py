@@ -15,8 +15,8 @@ from poise.env import ObsTerm, RewardTerm
 from poise.env import observations as obs
 from poise.env import rewards as reward
 from poise.env.frame import Frame, PointGoal, Pose
-from poise.errors import PoiseError
 from poise.motion.rotations import axis_angle_to_quat, heading_quat, normalize, quat_mul, quat_rotate
+from refusals import refused
 from toy_human import human
 
 N, B, J, H = 3, 5, 4, 6
@@ -269,7 +269,7 @@ def test_the_energy_is_not_halved_by_the_prior():
     # 0.5 (r_task - 0.001 e) = 0.5 r_task - 0.0005 e
     assert 0.5 * term.weight == pytest.approx(-0.0005) and not term.imitation
     assert reward.energy_term(1.0, "paper").params["form"] == "paper"
-    with pytest.raises(PoiseError, match="cost"):
+    with refused("settings-conflict"):
         RewardTerm("energy", reward.energy, -1.0)
 
 

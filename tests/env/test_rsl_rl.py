@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from poise.env.faces import GROUP, RslRlVecEnv
-from poise.errors import PoiseError
+from refusals import refused
 
 
 @pytest.fixture
@@ -91,11 +91,11 @@ def test_rsl_rls_runner_learns_an_iteration(adapted) -> None:
 
 def test_mistakes_are_told(make_env, monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_env(2, auto_reset=False)
-    with pytest.raises(PoiseError, match="auto_reset"):
+    with refused("auto-reset-needed"):
         RslRlVecEnv(env)
     env.close()
     monkeypatch.setitem(sys.modules, "tensordict", None)
     env = make_env(2)
-    with pytest.raises(PoiseError, match=r"poise-motion\[rsl-rl\]"):
+    with refused("extra-missing", says="poise-motion[rsl-rl]"):
         RslRlVecEnv(env)
     env.close()

@@ -11,6 +11,7 @@ from handmade_rigs import bvh_of, walker
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.formats.table import read_skeleton
+from refusals import refused
 
 
 @pytest.mark.parametrize("second", ["B_", ""])
@@ -55,5 +56,5 @@ def test_a_file_without_a_frame_is_a_rig(tmp_path: Path) -> None:
         else:
             assert np.abs(clip.positions() - rig.world()[0]).max() < 1e-4
     path.write_text(frames["none"])
-    with pytest.raises(PoiseError, match=r"no frame of motion.*as it rests it serves"):
+    with refused("no-frames"):
         read_clip(path)

@@ -14,6 +14,7 @@ from poise.errors import PoiseError
 from poise.formats import WRITERS, read_clip, write_bvh, write_clip
 from poise.motion import Clip, Skeleton, trim
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul
+from refusals import refused
 
 TRAVEL = """HIERARCHY
 ROOT joint_Root
@@ -234,9 +235,9 @@ def test_writing_refuses_and_leaves_nothing(tmp_path: Path) -> None:
             write_clip(clip, target)
         assert str(error.value) == f"{target}: {what}"
     (tmp_path / "dir.bvh").mkdir()
-    with pytest.raises(PoiseError, match="this is a folder"):
+    with refused("is-folder"):
         write_clip(clip, tmp_path / "dir.bvh")
-    with pytest.raises(PoiseError, match="rotation order"):
+    with refused("bad-axis-order"):
         write_bvh(clip, tmp_path / "b.bvh", order="XYX")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bvh", "dir.bvh"]
 

@@ -11,10 +11,10 @@ import pytest
 from handmade_fbx_files import BONES, fbx_text, travel, turns
 from scipy.spatial.transform import Rotation
 
-from poise.errors import PoiseError
 from poise.formats import fbx as fbx_read
 from poise.formats import read_clip
 from poise.formats.fbx_scene import skeleton
+from refusals import refused
 
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx")
 
@@ -56,7 +56,7 @@ def test_z_up_takes_and_rates(tmp_path: Path) -> None:
     assert clip.fps == 60 and clip.frames == 15
     # The file's Y is up no more: what was up lies along the floor.
     assert np.ptp(clip.positions()[0, :, 2]) < np.ptp(clip.positions()[0, :, 1])
-    with pytest.raises(PoiseError, match=r"it has no take 'Run'\. It has 'Walk'"):
+    with refused("unknown-take", says=("Run", "Walk")):
         read_clip(path, take="Run")
 
 
@@ -64,15 +64,15 @@ def test_z_up_takes_and_rates(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (fbx_text(bones=False), "the file holds no bones"),
-        (fbx_text(moves=False), "the file holds no animation"),
-        (fbx_text()[:3000], "Error|cannot read|no animation|no bones|damaged"),
-        ("; FBX 7.4.0 project file\n" + "a: {" * 100_000, "cannot read|damaged|no animation|could not"),
+        (fbx_text(bones=False), "no-joints"),
+        (fbx_text(moves=False), "no-animation"),
+        (fbx_text()[:3000], "file-damaged"),
+        ("; FBX 7.4.0 project file\n" + "a: {" * 100_000, "file-damaged"),
     ],
 )
 def test_what_is_no_motion_is_refused(tmp_path: Path, text: str, said: str) -> None:
     path = put(tmp_path, text)
-    with pytest.raises(PoiseError, match=said) as error:
+    with refused(said) as error:
         read_clip(path)
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
@@ -81,14 +81,12 @@ def test_without_the_package_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fbx_read, "find_spec", lambda name: None)
-    with pytest.raises(
-        PoiseError, match=r"FBX files need the package ufbx\. Install it with: pip install ufbx"
-    ):
+    with refused("extra-missing", says="ufbx"):
         read_clip(put(tmp_path, fbx_text()))
 
 
 def test_the_skeleton_is_the_largest_tree_of_bones_below_what_moves() -> None:
-    def refuse(what: str, hint: str | None = None) -> NoReturn:
+    def refuse(what: str, hint: str | None = None, code: str = "") -> NoReturn:
         raise ValueError(what)
 
     # File, armature, empty, hips, prop below no bone, spine, mesh, head below the mesh, another bone.

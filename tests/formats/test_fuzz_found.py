@@ -8,6 +8,7 @@ import struct
 import warnings
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +18,14 @@ from test_opensim_files import mot
 
 from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
+from refusals import refused
 
 
-def refusal(path: Path, data: bytes) -> str:
+def refusal(path: Path, data: bytes, *told: Any) -> str:
     path.write_bytes(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(PoiseError) as error:
+        with refused(*told) if told else pytest.raises(PoiseError) as error:
             read_clip(path, allow_pickle=True)
     message = str(error.value)
     assert message.startswith(str(path)) and message.isprintable()
@@ -38,7 +40,7 @@ def table(tmp_path: Path) -> str:
 
 @pytest.mark.parametrize("uri", [".", "./"])
 def test_a_buffer_that_is_a_folder(tmp_path: Path, uri: str) -> None:
-    assert "buffer" in refusal(tmp_path / "a.gltf", walker()[0].gltf(uri).encode())
+    refusal(tmp_path / "a.gltf", walker()[0].gltf(uri).encode(), "file-missing", "buffer")
 
 
 def test_a_header_without_its_shape(tmp_path: Path) -> None:
@@ -52,7 +54,7 @@ def test_a_number_of_the_record_beyond_all_bounds(tmp_path: Path, table: str) ->
     record = json.loads(lines[at].partition(":")[2])
     record["unit_m"] = 10**400
     lines[at] = "# source: " + json.dumps(record)
-    assert "source is damaged" in refusal(tmp_path / "a.csv", "\n".join(lines).encode())
+    refusal(tmp_path / "a.csv", "\n".join(lines).encode(), "file-damaged")
 
 
 def test_ends_on_joints_beyond_all_bounds(tmp_path: Path, table: str) -> None:
@@ -61,7 +63,7 @@ def test_ends_on_joints_beyond_all_bounds(tmp_path: Path, table: str) -> None:
     record = json.loads(lines[at].partition(":")[2])
     record["ends"] = [[1e300, 0, 0, 0]]
     lines[at] = "# skeleton: " + json.dumps(record)
-    assert "on no joint" in refusal(tmp_path / "a.csv", "\n".join(lines).encode())
+    refusal(tmp_path / "a.csv", "\n".join(lines).encode(), "number-unusable")
 
 
 @pytest.mark.parametrize("data", [b"\xef\xbb\xbf", b"\n", b"\r\n", b" ", b"\xef\xbb\xbf\n"])
@@ -74,7 +76,7 @@ def test_a_member_whose_name_is_no_text(tmp_path: Path) -> None:
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("pos\u00e9.npy", b"x")
     data = buffer.getvalue().replace("\u00e9".encode(), b"\xff\xff")
-    assert "damaged" in refusal(tmp_path / "a.npz", data)
+    refusal(tmp_path / "a.npz", data, "file-damaged")
 
 
 def test_a_signalling_nan_is_no_warning(tmp_path: Path) -> None:
@@ -89,7 +91,7 @@ def test_a_signalling_nan_is_no_warning(tmp_path: Path) -> None:
 @pytest.mark.parametrize("time", ["inf", "nan", "1e300"])
 def test_times_of_opensim_that_are_no_seconds(tmp_path: Path, time: str) -> None:
     data = mot().replace("0.01000000\t", f"{time}\t", 1).encode()
-    assert "times are no usable numbers" in refusal(tmp_path / "a.mot", data)
+    refusal(tmp_path / "a.mot", data, "times-unusable")
 
 
 def test_keypoints_that_are_one_place_but_for_an_outlier(tmp_path: Path) -> None:
@@ -105,13 +107,13 @@ def test_keypoints_that_are_one_place_but_for_an_outlier(tmp_path: Path) -> None
     [
         (
             {"parents": np.array([-1.0, np.nan, 0.0])},
-            "array 'parents' holds a number that is no joint's",
+            ("index-outside", "parents"),
         ),
         (
             {"end_joints": np.array([1e300, 1, 2])},
-            "array 'end_joints' holds a number that is no joint's",
+            ("index-outside", "end_joints"),
         ),
-        ({"offsets": np.full((3, 3), 1e-300)}, "no bone of the skeleton has any length"),
+        ({"offsets": np.full((3, 3), 1e-300)}, ("skeleton-without-length",)),
     ],
 )
 def test_arrays_of_poises_own_that_make_no_body(
@@ -120,7 +122,7 @@ def test_arrays_of_poises_own_that_make_no_body(
     write_clip(odd_clip(), tmp_path / "sound.poise.npz")
     with np.load(tmp_path / "sound.poise.npz") as file:
         np.savez(tmp_path / "changed.npz", **{**file, **change})
-    assert said in refusal(tmp_path / "a.npz", (tmp_path / "changed.npz").read_bytes())
+    refusal(tmp_path / "a.npz", (tmp_path / "changed.npz").read_bytes(), *said)
 
 
 def test_a_note_that_never_ends_is_cut(tmp_path: Path, table: str) -> None:
@@ -145,12 +147,10 @@ def test_a_joint_name_that_no_file_could_hold(tmp_path: Path) -> None:
     names = motion["skeleton_tree"]["node_names"]
     names[1] = "right_\0\1"
     save_npy(tmp_path / "a.npy", motion)
-    assert "'right_??' is no joint name" in refusal(
-        tmp_path / "b.npy", (tmp_path / "a.npy").read_bytes()
-    )
+    refusal(tmp_path / "b.npy", (tmp_path / "a.npy").read_bytes(), "not-a-name", "right_")
 
 
 def test_times_beyond_all_bounds(tmp_path: Path, table: str) -> None:
     line = next(x for x in reversed(table.splitlines()) if x)
     far = table.replace(line, "1e308" + line[line.index(",") :])
-    assert "s after the one before it" in refusal(tmp_path / "a.csv", far.encode())
+    refusal(tmp_path / "a.csv", far.encode(), "times-uneven")

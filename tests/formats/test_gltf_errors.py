@@ -18,12 +18,13 @@ from handmade_gltf_files import Gltf, put, turn, walker
 from poise.errors import PoiseError
 from poise.formats import gltf_file, read_clip
 from poise.motion import describe
+from refusals import refused
 
 HUGE = 1 << 34
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(PoiseError) as error:
+def refusal(path: Path, *told: Any) -> str:
+    with refused(*told) if told else pytest.raises(PoiseError) as error:
         read_clip(path)
     message = str(error.value)
     assert message.startswith(str(path)) and "\n" not in message
@@ -56,82 +57,78 @@ def sampler(**fields: object) -> Callable[[dict[str, Any]], object]:
 CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no animation": (
         lambda d: d.update(animations=[]),
-        ": the file holds no animation. Export it with its animation; as it rests it serves "
-        "`poise retarget --onto` alone",
+        ("no-animation",),
     ),
     "nothing moves": (
         lambda d: d["animations"][0].update(channels=[]),
-        ": no animation of the file moves or turns a node",
+        ("nothing-moves",),
     ),
     "no nodes": (
         lambda d: d.update(nodes=[]),
-        ": the file has no nodes, so there is nothing that could move",
+        ("no-joints",),
     ),
     "a cycle": (
         lambda d: (d["nodes"][4].update(children=[0]), d["scenes"][0].update(nodes=[])),
-        ": the nodes around 'Hips' form a cycle",
+        ("hierarchy-cycle", "Hips"),
     ),
-    "two parents": (node(1, children=[2, 4]), ": node 'LeftFoot' has two parents"),
+    "two parents": (node(1, children=[2, 4]), ("second-parent", "LeftFoot")),
     "a child that is not there": (
         node(4, children=[99]),
-        ": a child of node 'LeftFoot' refers to entry '99', but there are 5",
+        ("index-outside", ("LeftFoot", "99", "5")),
     ),
     "an accessor out of bounds": (
         accessor(0, count=1000),
-        ": accessor 0 (the values of channel 0 of animation 'walk') needs 12000 bytes of a view of 84",
+        ("data-out-of-bounds", ("walk", "12000", "84")),
     ),
     "a view out of bounds": (
         view(0, byteLength=100_000),
-        ": the view of accessor 0 (the values of channel 0 of animation 'walk') ends at byte 100000 "
-        "of a buffer of 252",
+        ("data-out-of-bounds", ("walk", "100000", "252")),
     ),
     "a huge count": (
         accessor(1, count=10**9),
-        ": its animation has more than 40000000 keys. Cut it into shorter clips",
+        ("clip-too-long", "40000000"),
     ),
     "a count that is no number": (
         accessor(1, count="many"),
-        ": the count of accessor 1 (the times of channel 0 of animation 'walk') is 'many', no "
-        "usable number",
+        ("number-unusable", ("walk", "many")),
     ),
     "a wrong type": (
         accessor(0, type="VEC4"),
-        ": accessor 0 (the values of channel 0 of animation 'walk') must be of type VEC3, got 'VEC4'",
+        ("wrong-type", ("walk", "VEC3", "VEC4")),
     ),
     "an unknown component": (
         accessor(0, componentType=7),
-        ": accessor 0 (the values of channel 0 of animation 'walk') has the unknown component type '7'",
+        ("wrong-type", ("walk", "7")),
     ),
     "an unknown interpolation": (
         sampler(interpolation="MAGIC"),
-        ": channel 0 of animation 'walk' has the unknown interpolation 'MAGIC'",
+        ("unknown-choice", ("walk", "MAGIC")),
     ),
     "too few values": (
         accessor(0, count=6),
-        ": the translation of node 'Hips' has 6 values for 7 keys",
+        ("count-differs", ("translation", "Hips")),
     ),
     "compressed": (
         view(0, extensions={"EXT_meshopt_compression": {}}),
-        ": the data of accessor 0 (the values of channel 0 of animation 'walk') are compressed with "
-        "EXT_meshopt_compression. Export the file without compression",
+        ("compressed", ("walk", "EXT_meshopt_compression")),
     ),
     "mirrored": (
         node(1, scale=[-1, 1, 1]),
-        ": the scale of node 'Spine' mirrors space, which no body can follow",
+        ("scale-unusable", ("Spine", "mirrors space")),
     ),
     "a matrix of words": (
         node(1, matrix=["a"] * 16),
-        ", node 'Spine': its matrix holds something that is no usable number",
+        ("number-unusable", ("Spine", "matrix")),
     ),
     "glTF 1": (
         lambda d: d.update(asset={"version": "1.0"}),
-        ": this is glTF version '1.0'. Export it as glTF 2.0",
+        ("version-unsupported", "1.0"),
     ),
     "no version": (
         lambda d: d.update(asset={"version": 2}),
-        ": the document states no glTF version (asset.version)",
+        ("part-missing",),
     ),
-    "nodes that are no list": (lambda d: d.update(nodes={}), ": 'nodes' is not a list of objects"),
+    "nodes that are no list": (lambda d: d.update(nodes={}), ("not-a-list", "nodes")),
 }
 
 
@@ -139,9 +136,9 @@ CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 def test_refusals(tmp_path: Path, case: str) -> None:
     change, message = CASES[case]
     file = changed(change)
-    assert refusal(put(tmp_path, "a.glb", file)) == message
+    refusal(put(tmp_path, "a.glb", file), *message)
     if case != "a view out of bounds":
-        assert refusal(put(tmp_path, "a.gltf", file)) == message
+        refusal(put(tmp_path, "a.gltf", file), *message)
 
 
 def test_values_that_are_no_numbers_are_named(tmp_path: Path) -> None:
@@ -150,17 +147,11 @@ def test_values_that_are_no_numbers_are_named(tmp_path: Path) -> None:
     turns[4, 1] = np.nan
     animation = file.doc["animations"][0]
     file.channel(animation, at["Head"], "rotation", [k / 30 for k in range(7)], turns)
-    assert (
-        refusal(put(tmp_path, "a.glb", file))
-        == ": the rotation of joint 'Head' is no usable number at key 4 (0.1333 s)"
-    )
+    refusal(put(tmp_path, "a.glb", file), "number-unusable", ("rotation", "Head", "0.1333"))
     turns[4] = 0
     file, at = walker()
     file.channel(file.doc["animations"][0], at["Head"], "rotation", [k / 30 for k in range(7)], turns)
-    assert (
-        refusal(put(tmp_path, "a.glb", file))
-        == ": the rotation of joint 'Head' has no length at key 4 (0.1333 s)"
-    )
+    refusal(put(tmp_path, "a.glb", file), "not-a-rotation", ("Head", "4", "0.1333"))
     for times, message in (
         ([0, 0.1, 0.05], "goes back in time at key 2 (0.05 s)"),
         ([0, np.nan, 0.1], "has no usable time at key 1"),
@@ -254,31 +245,25 @@ def test_small_files_cannot_ask_for_endless_work(tmp_path: Path) -> None:
     file.doc["animations"][0]["channels"].append(
         {"sampler": 2, "target": {"node": at["Head"], "path": "rotation"}}
     )
-    assert "Cut it shorter, or state a lower rate" in refusal(put(tmp_path, "a.glb", file))
+    refusal(put(tmp_path, "a.glb", file), "clip-too-long")
     file = changed(lambda d: d.update(nodes=[{} for _ in range(gltf_file.MAX_OBJECTS + 1)]))
-    assert refusal(put(tmp_path, "b.glb", file)) == (
-        ": 'nodes' has 100001 entries, more than the 100000 allowed"
-    )
+    refusal(put(tmp_path, "b.glb", file), "over-limit", ("nodes", "100001", "100000"))
     path = tmp_path / "c.gltf"
     path.write_text('{"asset": {"version": "2.0"}, "nodes": ' + "[" * 100_000)
-    assert refusal(path) == ": this is not valid JSON"
+    refusal(path, "bad-json")
     # A chain of nodes, and many animated ones.
     deep: list[dict[str, Any]] = [{"name": f"n{i}", "children": [i + 1]} for i in range(50_000)]
     file = changed(lambda d: d.update(nodes=[*deep, {"name": "end"}], skins=[]))
     file.doc["animations"][0]["channels"] = [{"sampler": 1, "target": {"node": 0, "path": "rotation"}}]
-    assert refusal(put(tmp_path, "d.glb", file)) == (
-        ": its nodes are nested 50000 deep, more than any body's"
-    )
+    refusal(put(tmp_path, "d.glb", file), "nested-too-deep", "50000")
     flat: list[dict[str, Any]] = [{"name": "n0", "children": list(range(1, 9_000))}]
     file = changed(lambda d: d.update(nodes=flat + [{} for _ in range(8_999)], skins=[]))
     file.doc["animations"][0]["channels"] = [
         {"sampler": 1, "target": {"node": i, "path": "rotation"}} for i in range(9_000)
     ]
-    assert refusal(put(tmp_path, "e.glb", file)) == (": it has 9000 joints, more than the 1500 allowed")
+    refusal(put(tmp_path, "e.glb", file), "too-many-joints", ("9000", "1500"))
     file.doc["animations"][0]["channels"] *= 2
-    assert refusal(put(tmp_path, "f.glb", file)) == (
-        ": 'channels' of animation 0 has 18000 entries, more than the 10000 allowed"
-    )
+    refusal(put(tmp_path, "f.glb", file), "over-limit", ("channels", "18000", "10000"))
     assert time.perf_counter() - start < 30.0
 
 
@@ -366,6 +351,6 @@ def test_damaged_files(tmp_path: Path) -> None:
 
 def test_an_address_too_long_for_any_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text(walker()[0].gltf("x" * 5000))
-    assert "buffer" in refusal(tmp_path / "a.gltf")
+    refusal(tmp_path / "a.gltf", "address-malformed")
     (tmp_path / "a.gltf").write_text(walker()[0].gltf("x" * 300))
-    assert "buffer" in refusal(tmp_path / "a.gltf")
+    refusal(tmp_path / "a.gltf", "address-malformed")

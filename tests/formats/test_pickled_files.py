@@ -19,6 +19,7 @@ from handmade_numpy_files import aist, poselib, save_npy, save_npz, save_pickle
 from poise.errors import PoiseError
 from poise.formats import pickles, read_clip, write_clip
 from poise.formats.pickles import load_plain, loads_restricted, named_arrays
+from refusals import refused
 
 
 def load_restricted(path):  # type: ignore[no-untyped-def]
@@ -82,41 +83,41 @@ def hashed_for_ever() -> bytes:
 
 
 REFUSED = {
-    "a call": (pickle.dumps({"a": Evil()}), "the pickle names 'posix.system', which is no plain data"),
-    "a class": (pickle.dumps(Path("a")), "which is no plain data"),
-    "numpy's load": (b"\x80\x02cnumpy\nload\n.", "the pickle names 'numpy.load'"),
-    "builtins": (b"\x80\x02c__builtin__\neval\n.", "the pickle names '__builtin__.eval'"),
-    "an instance": (b"\x80\x02(i__main__\nA\n.", "uses INST"),
-    "persistent": (b"\x80\x02Pabc\n.", "uses PERSID"),
-    "an extension": (b"\x80\x02\x82\x01.", "uses EXT1"),
-    "cut off": (pickle.dumps(PLAIN)[:-200], "the pickle is damaged"),
-    "no end": (b"\x80\x02K\x01", "the pickle is damaged"),
-    "empty stack": (b"\x80\x02.", "the pickle is damaged"),
-    "no mark": (b"\x80\x02]e.", "the pickle is damaged"),
-    "huge bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b"ab.", "the pickle is damaged"),
-    "huge bytearray": (b"\x80\x05\x96" + struct.pack("<Q", 1 << 40) + b"ab.", "the pickle is damaged"),
-    "a set": (pickle.dumps({"a": {1}}), "uses EMPTY_SET"),
-    "no instruction": (b"\x80\x02\xff.", "uses an unknown instruction"),
-    "a state of a list": (b"\x80\x02]}b.", "the pickle is damaged"),
-    "a call of a list": (b"\x80\x02])R.", "the pickle is damaged"),
+    "a call": (pickle.dumps({"a": Evil()}), ("pickle-refused", "posix.system")),
+    "a class": (pickle.dumps(Path("a")), ("pickle-refused",)),
+    "numpy's load": (b"\x80\x02cnumpy\nload\n.", ("pickle-refused", "numpy.load")),
+    "builtins": (b"\x80\x02c__builtin__\neval\n.", ("pickle-refused", "__builtin__.eval")),
+    "an instance": (b"\x80\x02(i__main__\nA\n.", ("pickle-refused", "INST")),
+    "persistent": (b"\x80\x02Pabc\n.", ("pickle-refused", "PERSID")),
+    "an extension": (b"\x80\x02\x82\x01.", ("pickle-refused", "EXT1")),
+    "cut off": (pickle.dumps(PLAIN)[:-200], ("file-damaged",)),
+    "no end": (b"\x80\x02K\x01", ("file-damaged",)),
+    "empty stack": (b"\x80\x02.", ("file-damaged",)),
+    "no mark": (b"\x80\x02]e.", ("file-damaged",)),
+    "huge bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b"ab.", ("file-damaged",)),
+    "huge bytearray": (b"\x80\x05\x96" + struct.pack("<Q", 1 << 40) + b"ab.", ("file-damaged",)),
+    "a set": (pickle.dumps({"a": {1}}), ("pickle-refused", "EMPTY_SET")),
+    "no instruction": (b"\x80\x02\xff.", ("pickle-refused",)),
+    "a state of a list": (b"\x80\x02]}b.", ("file-damaged",)),
+    "a call of a list": (b"\x80\x02])R.", ("file-damaged",)),
     "huge array": (
         b"\x80\x02cnumpy\nndarray\n0cnumpy.core.multiarray\n_reconstruct\n)R(K\x01\x8a\x06"
         + (1 << 44).to_bytes(6, "little")
         + b"\x85cnumpy\ndtype\nX\x02\x00\x00\x00f8\x85R\x89U\x01atb.",
-        "POP",
+        ("pickle-refused", "POP"),
     ),
     "bytes of a number": (
         b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n)R(K\x01K\x05\x85cnumpy\ndtype\nX\x02\x00\x00"
         b"\x00f8\x85R\x89J\xff\xff\xff\x7ftb.",
-        "the pickle is damaged",
+        ("file-damaged",),
     ),
-    "hash bomb": (hashed_for_ever(), "the pickle is damaged ('a key is no text')"),
-    "nesting": (b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b".", "nested too deeply"),
-    "a list": (pickle.dumps([1, 2]), "the pickle holds a list, not a dict of named arrays"),
-    "odd keys": (pickle.dumps({1: 2}), "not a dict of named arrays"),
+    "hash bomb": (hashed_for_ever(), ("file-damaged",)),
+    "nesting": (b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b".", ("nested-too-deep",)),
+    "a list": (pickle.dumps([1, 2]), ("wrong-type", "list")),
+    "odd keys": (pickle.dumps({1: 2}), ("wrong-type",)),
     "structured": (
         pickle.dumps({"a": np.zeros(2, dtype=[("x", "f8")])}),
-        "the pickle is damaged",
+        ("file-damaged",),
     ),
 }
 
@@ -128,10 +129,10 @@ def test_refusals(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) ->
     path = tmp_path / "a.pkl"
     path.write_bytes(data)
     start = time.perf_counter()
-    with pytest.raises(PoiseError) as error:
+    with refused(*message) as error:
         load_restricted(path)
     text = str(error.value)
-    assert text.startswith(f"{path}: ") and message in text and "\n" not in text
+    assert text.startswith(f"{path}: ") and "\n" not in text
     assert time.perf_counter() - start < 2.0
     assert not (tmp_path / "evil").exists()
 
@@ -152,7 +153,7 @@ def test_bytes_that_are_shared_do_not_multiply(monkeypatch: pytest.MonkeyPatch) 
         b"\x89h\x01tb"
     )
     assert len(loads_restricted(start + array * 9 + b"e.", "a")) == 10
-    with pytest.raises(PoiseError, match="more arrays than the limit"):
+    with refused("over-limit"):
         loads_restricted(start + array * 12 + b"e.", "a")
 
 
@@ -183,7 +184,7 @@ def test_no_instruction_is_known_that_calls_or_looks_up() -> None:
 
 def test_poselib_local_and_global_are_one_motion(tmp_path: Path) -> None:
     data = poselib()
-    with pytest.raises(PoiseError, match=r"this is a pickled file. Read it with --allow-pickle"):
+    with refused("pickle-refused", says="--allow-pickle"):
         read_clip(save_npy(tmp_path / "a.npy", data))
     clip = read_clip(tmp_path / "a.npy", allow_pickle=True)
     assert clip.fps == 30.0 and clip.skeleton.names == tuple(data["skeleton_tree"]["node_names"])
@@ -253,7 +254,7 @@ def test_a_pickled_member_of_an_npz_is_asked_for(tmp_path: Path) -> None:
 
     data = {**amass(66), "gender": np.array("male", dtype=object)}
     path = save_npz(tmp_path / "a.npz", data)
-    with pytest.raises(PoiseError, match="array 'gender': it holds pickled objects"):
+    with refused("pickle-refused", says="array 'gender'"):
         read_clip(path)
     clip = read_clip(path, allow_pickle=True)
     assert dict(clip.skeleton.source.extra)["gender"] == "male"

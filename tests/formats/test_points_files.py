@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from handmade_numpy_files import amass, save_npz
 
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.formats.c3d import c3d_points
 from poise.formats.point_arrays import HUMANML3D, array_points, mdm_points
@@ -18,6 +17,7 @@ from poise.formats.point_raw import assemble_points
 from poise.formats.point_tables import csv_points, trc_points
 from poise.formats.raw import ReadOptions
 from poise.motion import Clip
+from refusals import refused
 
 # A standing person in a file's Y-up axes, facing +Z, left at +X, m.
 PERSON = {
@@ -92,7 +92,7 @@ def test_a_trc_is_read_as_any_other_clip(tmp_path: Path) -> None:
     assert np.allclose(wrist, walking()[:, NAMES.index("RWrist")][:, [0, 2, 1]] * [1, -1, 1], atol=2e-3)
     assert read_clip(path, fps=60).fps == 60
     assert "low-pass at 6 Hz" in notes(read_clip(path, smooth_hz=6.0))
-    with pytest.raises(PoiseError, match="--smooth must be above 0"):
+    with refused("out-of-range", says="--smooth"):
         read_clip(path, smooth_hz=0.0)
 
 
@@ -116,31 +116,36 @@ def test_an_unknown_unit_is_guessed_from_the_persons_height(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.replace("\t0.860000\t", "\tabc\t", 1), r"line 6, column 40 \(RWrist Y\): 'abc'"),
-        (lambda t: t.replace("\t0.860000\t", "\t1_0\t", 1), "'1_0' is not a number"),
-        (lambda t: t.replace("\t0.860000\t", "\tinf\t", 1), "'inf' is not a usable number"),
-        (lambda t: t.replace("0.860000\t", "", 1), r"line 6: it has 52 columns and needs 53"),
-        (lambda t: "\n".join(t.splitlines()[:5]), "a header and no frames"),
-        (lambda t: "\n".join(t.splitlines()[:2]), "ends within its header"),
-        (lambda t: "\n".join(t.splitlines()[:6]), "it has 1 frame; motion needs at least 2"),
-        (lambda t: t.replace("DataRate", "Rate", 1), "no DataRate"),
-        (lambda t: t.replace("LHip", "RHip"), "'RHip' appears twice"),
-        (lambda t: t.replace("RAnkle", "Foo"), "no keypoint is the right ankle"),
-        (lambda t: t.replace("\t17\tm\t", "\t18\tm\t"), "states 18 markers and there are 17 labels"),
-        (lambda t: t.replace("\tm\t", "\tmm\t", 1), "would be .* mm tall"),
+        (
+            lambda t: t.replace("\t0.860000\t", "\tabc\t", 1),
+            ("not-a-number", ("line 6, column 40 (RWrist Y)", "abc")),
+        ),
+        (lambda t: t.replace("\t0.860000\t", "\t1_0\t", 1), ("not-a-number", "1_0")),
+        (lambda t: t.replace("\t0.860000\t", "\tinf\t", 1), ("number-unusable", "inf")),
+        (lambda t: t.replace("0.860000\t", "", 1), ("row-width", ("line 6", "52", "53"))),
+        (lambda t: "\n".join(t.splitlines()[:5]), ("no-frames",)),
+        (lambda t: "\n".join(t.splitlines()[:2]), ("file-cut-off",)),
+        (lambda t: "\n".join(t.splitlines()[:6]), ("clip-too-short", "1")),
+        (lambda t: t.replace("DataRate", "Rate", 1), ("rate-missing",)),
+        (lambda t: t.replace("LHip", "RHip"), ("name-repeated", "RHip")),
+        (lambda t: t.replace("RAnkle", "Foo"), ("keypoint-missing", "right ankle")),
+        (lambda t: t.replace("\t17\tm\t", "\t18\tm\t"), ("count-differs", ("18", "17"))),
+        (lambda t: t.replace("\tm\t", "\tmm\t", 1), ("unit-implausible", "mm")),
     ],
-)  # fmt: skip
-def test_broken_trc_files_are_refused_in_one_sentence(tmp_path: Path, change: Any, message: str) -> None:
+)
+def test_broken_trc_files_are_refused_in_one_sentence(
+    tmp_path: Path, change: Any, message: tuple
+) -> None:
     path = saved(tmp_path, change(trc_text()))
-    with pytest.raises(PoiseError, match=message) as caught:
+    with refused(*message) as caught:
         read_clip(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
 
 def test_flat_points_and_empty_ones_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(PoiseError, match=r"Z never changes, as in the 2D of a camera.*Pose2Sim"):
+    with refused("flat-keypoints", says="Z"):
         read_clip(saved(tmp_path, trc_text(walking() * [1.0, 1.0, 0.0])))
-    with pytest.raises(PoiseError, match="every keypoint is missing in every frame"):
+    with refused("keypoints-unseen"):
         read_clip(saved(tmp_path, trc_text(walking() * np.nan)))
 
 
@@ -187,7 +192,7 @@ def test_a_table_below_a_long_licence_is_read(tmp_path: Path) -> None:
     licence = "".join(f"# line {k} of a long licence text\n" for k in range(400))
     clip = read_clip(saved(tmp_path, licence + csv_text(walking()), "x.csv"))
     assert clip.frames == 8 and clip.skeleton.source.format == "csv"
-    with pytest.raises(PoiseError, match="no table of keypoints and no CSV of Poise"):
+    with refused("wrong-format"):
         read_clip(saved(tmp_path, licence, "x.csv"))
 
 
@@ -201,25 +206,30 @@ def test_csv_confidence_of_zero_is_a_missing_point(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.replace("Nose_z", "Nose_q"), "keypoint 'Nose' has no column for z"),
-        (lambda t: t.replace("0.860000", "nope", 1), r"line 2, column 39 \(RWrist_y\): 'nope'"),
-        (lambda t: t.replace(",0.860000", "", 1), "it has 51 columns and the header names 52"),
-        (lambda t: t.splitlines()[0], "a header and no frames"),
-        (lambda t: t.replace("0.0800,", "0.0800e3,"), "times are uneven"),
-        (lambda t: t.replace("time", "frame"), "neither times nor a frame rate.*--fps"),
-        (lambda t: "# unit = ells\n" + t, "the unit 'ells' is not known"),
+        (lambda t: t.replace("Nose_z", "Nose_q"), ("column-missing", ("Nose", "z"))),
+        (
+            lambda t: t.replace("0.860000", "nope", 1),
+            ("not-a-number", ("line 2, column 39 (RWrist_y)", "nope")),
+        ),
+        (lambda t: t.replace(",0.860000", "", 1), ("row-width", ("51", "52"))),
+        (lambda t: t.splitlines()[0], ("no-frames",)),
+        (lambda t: t.replace("0.0800,", "0.0800e3,"), ("times-uneven",)),
+        (lambda t: t.replace("time", "frame"), ("rate-missing", "--fps")),
+        (lambda t: "# unit = ells\n" + t, ("unit-unknown", "ells")),
     ],
-)  # fmt: skip
-def test_broken_csv_files_are_refused_in_one_sentence(tmp_path: Path, change: Any, message: str) -> None:
+)
+def test_broken_csv_files_are_refused_in_one_sentence(
+    tmp_path: Path, change: Any, message: tuple
+) -> None:
     path = saved(tmp_path, change(csv_text(walking())), "x.csv")
-    with pytest.raises(PoiseError, match=message) as caught:
+    with refused(*message) as caught:
         read_clip(path)
     assert "\n" not in str(caught.value)
 
 
 def test_csv_in_2d_is_refused_with_what_to_do(tmp_path: Path) -> None:
     text = "time," + ",".join(f"{n}_x,{n}_y" for n in NAMES) + "\n0," + ",".join("1" for _ in range(34))
-    with pytest.raises(PoiseError, match=r"they are 2D.*Pose2Sim"):
+    with refused("flat-keypoints"):
         read_clip(saved(tmp_path, text, "x.csv"))
 
 
@@ -229,7 +239,7 @@ def test_openpose_is_refused_with_what_to_do(tmp_path: Path) -> None:
     folder.mkdir()
     path = saved(folder, frame, "cam01.0000.json")
     for given in (path, folder):
-        with pytest.raises(PoiseError, match=r"2D keypoints of one camera.*Pose2Sim.*TRC"):
+        with refused("flat-keypoints"):
             read_clip(given)
 
 
@@ -239,35 +249,35 @@ def test_keypoint_arrays(tmp_path: Path) -> None:
     clip = read_clip(path)
     assert (clip.frames, clip.fps, clip.skeleton.source.format) == (8, 30.0, "keypoints-npz")
     for change, message in (
-        ({"positions": walking()[..., :2]}, "they are 2D"),
-        ({"names": np.array(NAMES[:-1])}, "16 names and 17 keypoints"),
-        ({"fps": np.array(0.0)}, "frame rate must be from 0.1 to 2000"),
-        ({"up_axis": np.array("W")}, "up_axis must be one of Y, Z"),
-        ({"positions": np.array(["a"])}, "not numbers"),
+        ({"positions": walking()[..., :2]}, ("flat-keypoints",)),
+        ({"names": np.array(NAMES[:-1])}, ("count-differs", ("16", "17"))),
+        ({"fps": np.array(0.0)}, ("rate-out-of-range",)),
+        ({"up_axis": np.array("W")}, ("unknown-axis", "W")),
+        ({"positions": np.array(["a"])}, ("wrong-type",)),
     ):
         data = {"positions": walking(), "names": np.array(NAMES), "fps": np.array(30.0), **change}
-        with pytest.raises(PoiseError, match=message):
+        with refused(*message):
             array_points(data, path)
-    with pytest.raises(PoiseError, match="no frame rate"):
+    with refused("rate-missing"):
         array_points({"positions": walking(), "names": np.array(NAMES)}, path)
 
 
 def test_results_of_the_motion_diffusion_model(data_dir: Path) -> None:
     path = data_dir / "other/text_to_motion/mdm_results_pred.npy"
-    with pytest.raises(PoiseError, match="allow-pickle"):
+    with refused("pickle-refused", says="--allow-pickle"):
         read_clip(path)
     clip = read_clip(path, allow_pickle=True)
     assert (clip.fps, clip.frames, clip.skeleton.source.up_axis) == (20.0, 192, "Y")
     assert "holds 30 motions" in notes(clip) and "A person throws" in notes(clip)
     assert "LeftToeBase" in clip.skeleton.names and len(HUMANML3D) == 22
     assert "number 7 was read" in notes(read_clip(path, allow_pickle=True, take="7"))
-    with pytest.raises(PoiseError, match="number of a motion, got 'last'"):
+    with refused("option-malformed", says="last"):
         read_clip(path, allow_pickle=True, take="last")
     data = {"motion": np.zeros((2, 22, 3, 9)), "lengths": np.array([9, 12])}
     assert mdm_points(data, path).positions.shape == (9, 22, 3)
-    with pytest.raises(PoiseError, match="states 12 of 9 frames"):
+    with refused("length-differs", says=("12", "9")):
         mdm_points(data, path, ReadOptions(take="1"))
-    with pytest.raises(PoiseError, match="none with index 2"):
+    with refused("unknown-take", says="2"):
         mdm_points(data, path, ReadOptions(take="2"))
 
 
@@ -283,7 +293,7 @@ def test_joints_with_their_rate_are_read_as_joints_alone(tmp_path: Path) -> None
     stated = read_clip(tmp_path / "a.npy", fps=30.0, unit_m=1.0)
     assert dict(stated.skeleton.source.evidence)["unit"] == "Stated with --unit"
     bad = save_npz(tmp_path / "b.npz", {"joints": points[:, :9], "fps": np.array(30.0)})
-    with pytest.raises(PoiseError, match="others need names"):
+    with refused("wrong-shape"):
         read_clip(bad)
 
 
@@ -298,11 +308,11 @@ def test_joints_go_by_their_names_where_they_have_some(tmp_path: Path) -> None:
         heads = (c.positions()[:, c.skeleton.index("Head")] for c in (clip, sound))
         assert np.abs(next(heads) - next(heads)).max() < 0.02
     for wrong, said in (
-        (names[:21], "it has 21 names and 22 keypoints"),
-        (np.array([f"j{k}" for k in range(22)]), "no keypoint is the left hip"),
+        (names[:21], ("count-differs", ("21", "22"))),
+        (np.array([f"j{k}" for k in range(22)]), ("keypoint-missing", "left hip")),
     ):
         data = {"joints": points, "fps": np.array(30.0), "names": wrong}
-        with pytest.raises(PoiseError, match=said):
+        with refused(*said):
             read_clip(save_npz(tmp_path / "b.npz", data))
 
 
@@ -336,13 +346,13 @@ def test_broken_c3d_files_are_refused(tmp_path: Path) -> None:
     write_c3d(path, walking() * 1000, NAMES)
     whole = path.read_bytes()
     path.write_bytes(whole[:300])
-    with pytest.raises(PoiseError, match="not a C3D file"):
+    with refused("wrong-format"):
         read_clip(path)
     path.write_bytes(whole[:600])
-    with pytest.raises(PoiseError, match=r"end of the file|do not fit|damaged"):
+    with refused("file-cut-off"):
         read_clip(path)
     path.write_bytes(whole[:2] + b"\xff\x07" + whole[4:])
-    with pytest.raises(PoiseError, match="do not fit into"):
+    with refused("file-cut-off"):
         read_clip(path)
 
 
@@ -416,18 +426,18 @@ def test_a_keypoint_that_is_missing_throughout_is_named_or_left_out(
     for lost, said in (
         (
             ("LKnee",),
-            r"keypoint 'LKnee' is missing in every frame, and nothing else shows the left knee",
+            ("LKnee", "left knee"),
         ),
         (
             ("RHip", "Nose"),
-            r"keypoint 'RHip' is missing in every frame, .* shows the right hip\. Track ",
+            ("RHip", "right hip"),
         ),
         (
             ("LWrist", "LElbow"),
-            r"keypoints 'LElbow', 'LWrist' are missing .* the left elbow, left wrist",
+            ("LElbow", "LWrist", "left elbow, left wrist"),
         ),
     ):
-        with pytest.raises(PoiseError, match=said):
+        with refused("keypoints-unseen", says=said):
             read(*lost)
     few = read("Nose", "LBigToe")
     assert "Missing in every frame and left out: LBigToe, Nose" in notes(few)
@@ -454,5 +464,5 @@ def test_a_marker_that_is_missing_throughout_is_estimated_from_the_others(data_d
     assert "Only outer markers show the left knee" in notes(made)
     a, b = (c.positions()[:, c.skeleton.index("LeftLeg")] for c in (whole, made))
     assert np.linalg.norm(a - b, axis=-1).mean() < 0.025
-    with pytest.raises(PoiseError, match=r"'L_shoulder_study' is missing .* shows the left shoulder"):
+    with refused("keypoints-unseen", says=("L_shoulder_study", "left shoulder")):
         without("L_shoulder_study")

@@ -14,6 +14,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.own import columns
 from poise.motion import Clip
+from refusals import refused
 
 
 def check_same(a: Clip, b: Clip) -> None:
@@ -49,7 +50,7 @@ def test_the_content_tells_the_format(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"a.{suffix}").rename(tmp_path / "a.dat")
     check_same(read_clip(tmp_path / "a.dat"), odd_clip())
     assert read_clip(tmp_path / "a.dat", fps=25).fps == 25.0
-    with pytest.raises(PoiseError, match="--up is not for Poise's own files"):
+    with refused("option-not-applicable", says="--up"):
         read_clip(tmp_path / "a.dat", up_axis="Y")
 
 
@@ -77,73 +78,69 @@ def nan_at(table: np.ndarray, *at: int) -> np.ndarray:
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "newer": (
         {"poise_clip": np.array(2)},
-        ": the file has version 2 of Poise's clip format; this Poise reads up to 1. Install a newer "
-        "Poise",
+        ("version-unsupported", ("2", "1")),
     ),
     "missing": (
         {"rot": None, "fps": None},
-        ": this file of Poise lacks rot, fps. Known: poise_clip, names, parents, offsets, end_joints, "
-        "ends, root_pos, name, cyclic, source",
+        ("key-missing", "rot"),
     ),
     "shape": (
         {"rot": np.zeros((7, 2, 4))},
-        ", array 'rot': it has the shape 7 x 2 x 4, not 7 x 3 x 4",
+        ("wrong-shape", ("rot", "7 x 2 x 4", "7 x 3 x 4")),
     ),
     "text": (
         {"root_pos": np.array([["a", "b", "c"]] * 7)},
-        ", array 'root_pos': it holds str32 values, not numbers",
+        ("wrong-type", ("root_pos", "str32")),
     ),
     "nan": (
         {"rot": nan_at(odd_clip().rot, 4, 1, 2)},
-        ": the rotation of joint 'Hüfte, links' at frame 4 is nan, not a usable number",
+        ("number-unusable", ("4", "nan")),
     ),
     "root nan": (
         {"root_pos": nan_at(odd_clip().root_pos, 6, 0)},
-        ": the root position at frame 6 is nan, not a usable number",
+        ("number-unusable", ("6", "nan")),
     ),
     "no rotation": (
         {"rot": odd_clip().rot * np.where(np.arange(7) == 5, 2.0, 1.0)[:, None, None]},
-        ": the rotation of joint 'root' at frame 5 is not a unit quaternion (norm 2)",
+        ("not-a-rotation", ("root", "5", "2")),
     ),
     "no frames": (
         {"root_pos": np.zeros((0, 3)), "rot": np.zeros((0, 3, 4))},
-        ": the clip has 0 frames; motion needs at least 2",
+        ("clip-too-short", "0"),
     ),
     "no joints": (
         {"names": np.zeros(0, dtype="U1"), "rot": np.zeros((7, 0, 4)), "parents": np.zeros(0),
          "offsets": np.zeros((0, 3))},
-        ": it has 0 joints; 1 to 1500 are allowed",
+        ("joint-count", ("0", "1500")),
     ),
     "parents": (
         {"parents": np.array([-1, 2, 0])},
-        ": joint 'Hüfte, links' has parent index 2; the first joint must be the only root and parents "
-        "must come before children",
+        ("parent-order", ("Hüfte, links", "2")),
     ),
     "ends": (
         {"end_joints": np.array([1, 1, 3])},
-        ": array 'end_joints' names a joint that does not exist",
+        ("index-outside",),
     ),
     "counts": (
         {"parents": np.array([-1, 0])},
-        ": 3 names, 2 parents, 3 offsets, 3 end joints and 3 ends do not fit together",
+        ("count-differs", ("3", "2")),
     ),
-    "rate": ({"fps": np.array(0.0)}, ": the frame rate must be from 0.1 to 2000 per second, got 0"),
+    "rate": ({"fps": np.array(0.0)}, ("rate-out-of-range", ("0.1", "2000"))),
     "rates": (
         {"fps": np.array([1.0, 2.0])},
-        ", array 'fps': it has the shape 2, not 1",
+        ("wrong-shape", ("fps", "2", "1")),
     ),
     "source": (
         {"source": np.array('{"format": 3}')},
-        ": the record of the clip's source is damaged ('int in the wrong place'). The file seems cut "
-        "off",
+        ("file-damaged",),
     ),
     "json": (
         {"source": np.array("[" * 100000)},
-        ": the source record is damaged",
+        ("file-damaged", "source"),
     ),
     "twice": (
         {"names": np.array(["a", "b", "a"])},
-        ": joint name 'a' appears twice",
+        ("name-repeated", "a"),
     ),
 }  # fmt: skip
 
@@ -155,11 +152,10 @@ def test_npz_refusals(tmp_path: Path, case: str) -> None:
     if case == "twice":
         data["source"] = np.array('{"format": "bvh"}')
     path = save_npz(tmp_path / "a.npz", data)
-    with pytest.raises(PoiseError) as error:
+    with refused(*message) as error:
         read_clip(path)
     text = str(error.value)
-    assert text.startswith(f"{path}{message}") and "\n" not in text
-    assert case == "json" or text == f"{path}{message}"
+    assert text.startswith(str(path)) and "\n" not in text
 
 
 def test_unknown_fields_of_a_newer_source_are_left_out(tmp_path: Path) -> None:

@@ -18,10 +18,11 @@ from poise.errors import PoiseError
 from poise.formats import arrays as array_files
 from poise.formats import c3d, pickles, read_clip, write_clip
 from poise.formats.arrays import directory_bytes
+from refusals import refused
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(PoiseError) as error:
+def refusal(path: Path, *told: Any) -> str:
+    with refused(*told) if told else pytest.raises(PoiseError) as error:
         read_clip(path, allow_pickle=True)
     message = str(error.value)
     assert message.startswith(str(path)) and message.isprintable()
@@ -52,42 +53,42 @@ def mdm(**more: Any) -> dict[str, Any]:
 
 CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "unit below 0": (
-        lambda f: save_npz(f / "a.npz", keys(unit_m=-1.0)), ": unit_m must be above 0, got -1"),
+        lambda f: save_npz(f / "a.npz", keys(unit_m=-1.0)), ("out-of-range", "-1")),
     "up W": (
         lambda f: save_npz(f / "a.npz", keys(up_axis=b"W")),
-        ": up_axis must be one of Y, Z, X, -Y, -Z, -X, got 'W'",
+        ("unknown-axis", ("Y, Z, X, -Y, -Z, -X", "W")),
     ),
     "poses of two lengths": (
-        lambda f: save_npz(f / "a.npz", gvhmr(5)), ": its poses have different lengths: 12, 12, 5"),
+        lambda f: save_npz(f / "a.npz", gvhmr(5)), ("length-differs", "12, 12, 5")),
     "a scaling of 0": (
         lambda f: save_pickle(f / "a.pkl", {**aist(), "smpl_scaling": np.zeros(1)}),
-        ": smpl_scaling is 0, which must be above 0"),
+        ("out-of-range", "0")),
     "a tree that is a number": (
         lambda f: save_npy(f / "a.npy", {**poselib(), "skeleton_tree": 3}),
-        ": its skeleton_tree is no dict"),
+        ("wrong-type",)),
     "names that are numbers": (
         lambda f: save_npy(f / "a.npy", _tree(node_names=[1, 2])),
-        ": its node_names are no list of texts"),
+        ("wrong-type",)),
     "no names": (
         lambda f: save_npy(f / "a.npy", _tree(node_names=[])),
-        ": it has 0 joints; 1 to 1500 are allowed"),
+        ("joint-count", ("0", "1500"))),
     "a list of two dicts": (
         lambda f: save_pickle(f / "a.pkl", [{"a": 1}, {"a": 2}]),
-        ": the pickle holds a list, not a dict of named arrays"),
+        ("wrong-type", "list")),
     "a type among the data": (
         lambda f: save_pickle(f / "a.pkl", {"smpl_poses": np.ndarray}),
-        ": the pickle is damaged ('a type stands where data"),
+        ("file-damaged",)),
     "a type that is called": (
-        lambda f: _bytes(f / "a.pkl", b"c__builtin__\nobject\n(tR."), ": the pickle is damaged ("),
+        lambda f: _bytes(f / "a.pkl", b"c__builtin__\nobject\n(tR."), ("file-damaged",)),
     "an array of negative length": (
         lambda f: _bytes(f / "a.pkl", _state((-1,), b"")),
-        ": the pickle is damaged ('an array has a neg"),
+        ("file-damaged",)),
     "objects without an array": (
         lambda f: _bytes(f / "a.pkl", _state((3,), [1])),
-        ": the pickle is damaged ('an array has the wr"),
+        ("file-damaged",)),
     "an array of dates": (
         lambda f: save_pickle(f / "a.pkl", {"a": np.zeros(3, "M8[s]")}),
-        ": the pickle is damaged ('arrays of type M8"),
+        ("file-damaged",)),
 }  # fmt: skip
 
 
@@ -120,7 +121,7 @@ def _state(shape: tuple[int, ...], data: Any) -> bytes:
 @pytest.mark.parametrize("case", CASES)
 def test_a_mistake_is_named(tmp_path: Path, case: str) -> None:
     make, said = CASES[case]
-    assert refusal(make(tmp_path)).startswith(said)
+    refusal(make(tmp_path), *said)
 
 
 def test_a_list_of_one_dict_and_joints_of_the_file_are_taken(tmp_path: Path) -> None:
@@ -138,24 +139,24 @@ def test_a_rate_of_the_user_and_several_motions(tmp_path: Path) -> None:
     path = save_npz(tmp_path / "a.npz", keys())
     assert read_clip(path, fps=60.0).fps == 60.0
     path = save_npy(tmp_path / "m.npy", mdm(text=["", "a person hops"]))
-    with pytest.raises(PoiseError, match="it holds 2 motions, there is none with index 2"):
+    with refused("unknown-take", says="2"):
         read_clip(path, allow_pickle=True, take="2")
 
 
 def test_limits_of_archives_and_pickles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save_npz(tmp_path / "a.npz", keys())
     monkeypatch.setattr(array_files, "MAX_KEYS", 2)
-    assert refusal(path) == ": the archive holds more than 2 arrays"
+    refusal(path, "over-limit", "2")
     monkeypatch.setattr(array_files, "MAX_KEYS", 4096)
     most = directory_bytes(path)
     assert 0 < most < path.stat().st_size
     monkeypatch.setattr(array_files, "MAX_DIRECTORY", most - 1)
     with monkeypatch.context() as unread:
         unread.delattr(array_files.zipfile, "ZipFile")
-        assert refusal(path) == ": the archive holds more than 4096 arrays"
+        refusal(path, "over-limit", "4096")
     monkeypatch.setattr(pickles, "_MAX_STEPS", 5)
     path = save_pickle(tmp_path / "a.pkl", aist())
-    assert refusal(path) == ": the pickle has more than 5 instructions"
+    refusal(path, "over-limit", "5")
 
 
 def test_records_of_poises_own_files(tmp_path: Path) -> None:
@@ -163,11 +164,11 @@ def test_records_of_poises_own_files(tmp_path: Path) -> None:
     with np.load(tmp_path / "a.poise.npz") as file:
         sound = dict(file)
     for change, said in (
-        ({"source": np.array("[1]")}, "record is damaged ('it is no JSON object')"),
-        ({"source": np.array("{" + " " * 2_000_000)}, "record is damaged ("),
-        ({"offsets": sound["offsets"] * 1e12}, "array 'offsets' holds a number that is not usable"),
+        ({"source": np.array("[1]")}, ("file-damaged",)),
+        ({"source": np.array("{" + " " * 2_000_000)}, ("file-damaged",)),
+        ({"offsets": sound["offsets"] * 1e12}, ("number-unusable", "offsets")),
     ):
-        assert said in refusal(save_npz(tmp_path / "b.poise.npz", {**sound, **change}))
+        refusal(save_npz(tmp_path / "b.poise.npz", {**sound, **change}), *said)
 
 
 def test_c3d_files_of_several_people_and_unknown_units(tmp_path: Path) -> None:
@@ -186,16 +187,16 @@ def test_c3d_files_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.Monke
     write_c3d(path, walking() * 1000, NAMES)
     whole = path.read_bytes()
     path.write_bytes(whole[:16] + b"\xff\x00" + whole[18:])
-    assert refusal(path).startswith(": its header points beyond the end of the file")
+    refusal(path, "file-cut-off")
     path.write_bytes(whole)
     point: dict[str, Any] = {"points": np.ones((4, 3, 8)), "residuals": np.zeros((1, 3, 8)),
                              "rate": np.zeros(1), "LABELS": np.array(["a", "b", "c"])}  # fmt: skip
     monkeypatch.setattr(c3d, "read_limited", lambda *_: dict(point))
-    assert refusal(path).startswith(": the frame rate is 0")
+    refusal(path, "rate-out-of-range", "0")
     point["LABELS"] = np.array(["a", "b", "c", "d"])
-    assert refusal(path).startswith(": it holds 3 points and 4 labels")
+    refusal(path, "count-differs", ("3", "4"))
     monkeypatch.setattr(c3d, "find_spec", lambda _: None)
-    assert refusal(path).startswith(": C3D files need the package ezc3d")
+    refusal(path, "extra-missing")
 
 
 @pytest.mark.parametrize("comment", [b"", b"a comment", b"x" * 65_535])

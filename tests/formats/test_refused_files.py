@@ -17,10 +17,11 @@ from poise.formats import apart, read_clip, text, write_clip
 from poise.formats import table as formats
 from poise.formats.bvh import write_bvh
 from poise.formats.table import check_writable, home_suffix
+from refusals import refused
 
 
-def refusal(path: Path, **options: Any) -> str:
-    with pytest.raises(PoiseError) as error:
+def refusal(path: Path, *told: Any, **options: Any) -> str:
+    with refused(*told) if told else pytest.raises(PoiseError) as error:
         read_clip(path, **options)
     message = str(error.value)
     assert message.startswith(str(path)) and message.isprintable()
@@ -28,13 +29,13 @@ def refusal(path: Path, **options: Any) -> str:
 
 
 def test_paths_that_are_no_files(tmp_path: Path) -> None:
-    assert refusal(tmp_path / ("x" * 300 + ".bvh")).startswith(": the file cannot be opened (")
+    refusal(tmp_path / ("x" * 300 + ".bvh"), "file-unreadable")
     loop = tmp_path / "loop.bvh"
     loop.symlink_to(loop)
-    assert refusal(loop).startswith(": the file cannot be opened (")
+    refusal(loop, "file-unreadable")
     (tmp_path / "notes.json").write_text("[1]")
-    assert refusal(tmp_path) == ": this is a folder, not a motion file. Name one file in it"
-    with pytest.raises(PoiseError, match="this is a folder, not a motion file"):
+    refusal(tmp_path, "is-folder")
+    with refused("is-folder"):
         text.check_file(tmp_path)
 
 
@@ -63,7 +64,7 @@ def test_a_file_that_grows_beyond_the_limit(tmp_path: Path, monkeypatch: pytest.
     path = put(tmp_path, "a.bvh", bvh_text())
     # It was small when its size was asked for.
     monkeypatch.setattr(text, "check_file", lambda *_: 10)
-    with pytest.raises(PoiseError, match="the file grew beyond the limit while it was read"):
+    with refused("file-too-big"):
         text.read_bytes(path, limit=100)
 
 
@@ -88,23 +89,23 @@ def test_a_clip_goes_back_to_the_format_it_came_from(tmp_path: Path) -> None:
     }
     assert home_suffix(read_clip(put(tmp_path, "a.txt", deepmimic_text()))) == ".bvh"
     check_writable(tmp_path / "b.bvh")
-    with pytest.raises(PoiseError, match=r"cannot be written as '\.fbx'"):
+    with refused("format-not-written", says=".fbx"):
         check_writable(tmp_path / "b.fbx")
     if find_spec("pxr") is None:
-        with pytest.raises(PoiseError, match="usd-core"):
+        with refused("extra-missing", says="usd-core"):
             check_writable(tmp_path / "b.usda")
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"unit_m": 0.0}, "the unit must be above 0 metres, got 0.0"),
-        ({"unit_m": float("inf")}, "the unit must be above 0 metres, got inf"),
-        ({"up_axis": "W"}, "the up axis must be one of Y, Z, X, -Y, -Z, -X, got 'W'"),
+        ({"unit_m": 0.0}, ("out-of-range", "0.0")),
+        ({"unit_m": float("inf")}, ("out-of-range", "inf")),
+        ({"up_axis": "W"}, ("unknown-axis", "W")),
     ],
 )
-def test_units_and_verticals_of_a_bvh(tmp_path: Path, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(PoiseError, match=said):
+def test_units_and_verticals_of_a_bvh(tmp_path: Path, options: dict[str, Any], said: tuple) -> None:
+    with refused(*said):
         write_bvh(odd_clip(), tmp_path / "b.bvh", **options)
     assert not (tmp_path / "b.bvh").exists()
 

@@ -15,6 +15,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.table import read_skeleton
 from poise.motion import Clip
+from refusals import refused
 
 pytest.importorskip("pxr")
 
@@ -120,7 +121,7 @@ def test_a_binding_without_its_api_counts(tmp_path: Path) -> None:
 def test_a_rig_without_animation_serves_as_a_target(tmp_path: Path) -> None:
     rig = walker()
     rested = usda_of(skeleton_of(rig)).replace("rel skel:animationSource = <Anim>", "")
-    with pytest.raises(PoiseError, match=r"none is bound to its skeleton.*SkelBindingAPI"):
+    with refused("no-animation", says="SkelBindingAPI"):
         read(tmp_path, rested)
     clip = read_skeleton(tmp_path / "a.usda")
     assert clip.frames == 2 and clip.skeleton.names == rig.names

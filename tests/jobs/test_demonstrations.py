@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from poise.env.recovery.clips import CALM, QUICK
-from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.perpetual.run import begin, going_on, resume, train
@@ -23,6 +22,7 @@ from poise.learn.composer import Composer
 from poise.recipes.perpetual import build, standing
 from poise.recipes.perpetual_settings import WIDE, Perpetual
 from poise.recipes.shapes import BodyShapes
+from refusals import refused
 from toy_human import swing
 from toy_library import PLAIN, Scripted, library, lively, tiny
 
@@ -225,7 +225,7 @@ def test_a_policy_that_goes_on_learns_to_be_quick(tracker: Tracker) -> None:
 def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:
     """With a policy that hardly stands, so that it is lost; what comes out holds together."""
     config = TrackConfig(recover=True, controller="policy")
-    with pytest.raises(PoiseError, match="has not learned to come back"):
+    with refused("recovery-not-learned", says="come back"):
         track(swing(4.0, name="long"), tracker, config)
     made = build(lively(), tiny(recovery=True, **PLAIN))
     able = replace(tracker, recovery_clips=made.recovery_clips)
@@ -245,5 +245,5 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     # A policy that learned the motion still knows its recovery clips.
     learned = learn(able, plain.placed, tmp_path / "learned", Until(minutes=0.01), threads=1)
     assert learned.tracker.recovery_clips is able.recovery_clips
-    with pytest.raises(PoiseError, match="a single character"):
+    with refused("single-character-only"):
         TrackConfig(recover=True, count=2)

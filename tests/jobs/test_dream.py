@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.endless import dreamt as frames
 from poise.jobs.endless.dreaming import begun, dream, past_of
@@ -27,6 +26,7 @@ from poise.learn.cvae import CVAEConfig, CVAETraining
 from poise.motion import ClipLibrary, trim
 from poise.plan import LookaheadConfig
 from poise.score.card import NO_HELP
+from refusals import refused
 from toy_policy import walk
 
 SMALL = CVAEConfig(past=10, future=12, latent=4, hidden=32, layers=(32,))
@@ -82,7 +82,7 @@ def test_it_goes_on_from_a_clip_of_any_skeleton(model: GeneratorModel, tracker: 
     torch.testing.assert_close(pasts[0, :, 2:], past[:, 2:])
     made = dream(0.4, model, tracker, seed_clip=walk(), controller="policy", threads=1)
     assert made.motion.frames == 12
-    with pytest.raises(PoiseError, match=r"sees 10 frames at 30 Hz, 0.3 s, and the seed clip has 5"):
+    with refused("clip-too-short", says=("10 frames", "30 Hz", "5")):
         dream(1.0, model, tracker, seed_clip=trim(walk(), 0, 5))
 
 
@@ -129,23 +129,23 @@ def test_what_cannot_be_is_said(
     model: GeneratorModel, tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for seconds in (0.0, float("nan"), 1e6):
-        with pytest.raises(PoiseError, match="to 10 hours"):
+        with refused("out-of-range"):
             dream(seconds, model, tracker)
-    with pytest.raises(PoiseError, match="could not be read"):
+    with refused("file-unreadable"):
         dream(1.0, tmp_path / "none.safetensors", tracker)
-    with pytest.raises(PoiseError, match="1 to 16 characters"):
+    with refused("out-of-range", says="16"):
         Dream(count=0)
-    with pytest.raises(PoiseError, match="temperature"):
+    with refused("out-of-range", says="temperature"):
         Dream(temperature=-1)
-    with pytest.raises(PoiseError, match="target"):
+    with refused("out-of-range"):
         Dream(targets=((float("nan"), 0.0),))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
-    with pytest.raises(PoiseError, match="GB are free"):
+    with refused("disk-full"):
         dream(60.0, model, tracker, out=tmp_path / "big.bvh")
     # Two characters' motions need twice as much.
     need = 1.5 * NUMBER * 30 * 60 * (3 * len(tracker.example.skeleton) + 3)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need))
-    with pytest.raises(PoiseError, match="GB are free"):
+    with refused("disk-full"):
         dream(60.0, model, tracker, out=tmp_path / "big.bvh", count=2)
     assert not list(tmp_path.iterdir())
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from fleet_jobs import job, tries
 
-from poise.errors import PoiseError
 from poise.jobs.fleet import FLEET_FILE, combinations, read_table, run_fleet
 from poise.jobs.workers import LocalWorkers, error_in, launch, make_workers
+from refusals import refused
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
@@ -122,10 +122,10 @@ def test_errors_are_one_sentence(tmp_path: Path) -> None:
     assert error_in(tmp_path / "l", -9) == "its process was killed (SIGKILL)" and not error_in(
         tmp_path, 0
     )
-    with pytest.raises(PoiseError, match="two jobs of the fleet have the same name"):
+    with refused("name-repeated"):
         run_fleet([job(tmp_path, "a")] * 2, tmp_path, LocalWorkers(1, 1))
     (tmp_path / FLEET_FILE).write_text('{"format": 7}')
-    with pytest.raises(PoiseError, match="damaged or of another version"):
+    with refused("file-damaged"):
         run_fleet([job(tmp_path, "a")], tmp_path, LocalWorkers(1, 1))
 
 

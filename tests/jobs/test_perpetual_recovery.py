@@ -30,6 +30,7 @@ from poise.recipes.perpetual import build, standing, walking_clips
 from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.score import ClipResults
 from poise.settings import to_data
+from refusals import refused
 from toy_human import swing
 from toy_library import library, tiny
 
@@ -122,10 +123,14 @@ def test_a_body_that_never_lies_is_told_before_the_training(
     check_falls(built)
 
     def never(*_: object) -> None:
-        raise PoiseError("4 of 4 characters did not come to lie", hint="Drop them for more steps")
+        raise PoiseError(
+            "4 of 4 characters did not come to lie",
+            hint="Drop them for more steps",
+            code="fall-unsettled",
+        )
 
     monkeypatch.setattr(perpetual_recovery, "fall_states", never)
-    with pytest.raises(PoiseError, match=r"recovery: 4 of 4 characters.*--no-recovery"):
+    with refused("fall-unsettled", says=("recovery", "--no-recovery")):
         check_falls(built)
 
 
@@ -213,7 +218,7 @@ def test_runs_of_before_there_was_recovery_stay_as_they_were(tmp_path: Path) -> 
     assert begin(tmp_path, library(), config).config == config
     # How it was cloned is its own business, and no reason to refuse it.
     begin(tmp_path, library(), replace(config, clone=None))
-    with pytest.raises(PoiseError, match=r"other settings \(recovery\)"):
+    with refused("settings-differ", says="recovery"):
         begin(tmp_path, library(), replace(config, recovery=True))
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.errors import PoiseError
 from poise.jobs.perpetual import run as perpetual_result
 from poise.jobs.perpetual import stage_trainer as perpetual_judge
 from poise.jobs.perpetual.run import PerpetualResult, begin, train
@@ -24,6 +23,7 @@ from poise.learn.primitives import primitive
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual_settings import Perpetual
 from poise.sim import UnstableError
+from refusals import refused
 from toy_library import PPO, Script, Scripted, library, tiny
 
 
@@ -223,5 +223,5 @@ def test_steps_become_smaller_towards_the_end_of_a_stage(tmp_path: Path, scripte
     plain["expert"] = True
     _, shown, _ = watched(tmp_path / "cloned", tiny(ppo=fixed, **plain), 1)
     assert shown[0].stats.update.policy_lr == 1e-3
-    with pytest.raises(PoiseError, match="cooling is for steps of a fixed size"):
+    with refused("settings-conflict", says="cooling"):
         replace(config, ppo=replace(fixed, kl_target=0.05))

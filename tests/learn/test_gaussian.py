@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from poise.errors import PoiseError
 from poise.learn.networks import MLP, GaussianPolicy, gaussian_entropy, gaussian_kl, gaussian_log_prob
+from refusals import refused
 
 G = torch.Generator().manual_seed(0)
 MEAN, OTHER, X = (torch.randn(4, 6, 5, generator=G, dtype=torch.float64) for _ in range(3))
@@ -51,5 +51,5 @@ def test_a_fixed_deviation_has_no_gradient():
 
 @pytest.mark.parametrize("std", [0.0, (0.1, -1.0), (0.1, 0.1, 0.1)])
 def test_a_wrong_deviation_is_refused(std):
-    with pytest.raises(PoiseError, match="each of the 2 actions"):
+    with refused("out-of-range", says="2"):
         make(std)

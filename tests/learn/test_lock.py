@@ -14,6 +14,7 @@ from poise.errors import PoiseError
 from poise.learn import checkpoint as lock
 from poise.learn.checkpoint import only_writer
 from poise.learn.inbetween import train_inbetween
+from refusals import refused
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="folders cannot be locked there")
 HOLD = """
@@ -36,7 +37,7 @@ def test_the_second_writer_is_refused_and_writes_nothing(
         assert str(error.value) == (
             f"{folder}: another training writes here. Wait until it ends, or choose another folder"
         )
-        with pytest.raises(PoiseError, match="another training writes here"):
+        with refused("folder-in-use"):
             train_inbetween(trainer("transformer"), folder)
         assert list(folder.iterdir()) == []
     with only_writer(folder):

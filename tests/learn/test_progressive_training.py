@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from toy_point_env import PointEnv
 
-from poise.errors import PoiseError
 from poise.learn import (
     LATEST,
     CloneConfig,
@@ -32,6 +31,7 @@ from poise.learn import (
     run,
 )
 from poise.learn.primitives import count, primitive_log_std
+from refusals import refused
 
 TOY = PPOConfig(std=0.3, horizon=12, epochs=2, policy_hidden=(16,), value_hidden=(16,), minibatch=128)
 OBS = torch.rand(50, 4, generator=torch.Generator().manual_seed(8)) * 2 - 1
@@ -122,7 +122,7 @@ def test_resume_is_bit_exact_and_a_file_rebuilds_the_policy(kind, tmp_path):
     assert again.iterate().update == other.iterate().update
     # Another stage's checkpoint is refused.
     if kind != "column":
-        with pytest.raises(PoiseError, match="policy = "):
+        with refused("checkpoint-unfit", says="policy"):
             Trainer(PointEnv(32), TOY, 0, "point", warm_start=first()).load(tmp_path / "whole" / LATEST)
 
 
@@ -136,13 +136,13 @@ def test_a_new_column_begins_where_its_source_stands():
     plain.iterate()
     cloned = columns_of(plain.policy())
     assert torch.equal(cloned.act(OBS), plain.policy().act(OBS))
-    with pytest.raises(PoiseError, match="no primitives"):
+    with refused("no-primitives"):
         next_column(plain.policy(), generator=rng())
-    with pytest.raises(PoiseError, match="only a single perceptron"):
+    with refused("policy-of-primitives"):
         columns_of(two)
-    with pytest.raises(PoiseError, match="no primitive 2 among 2"):
+    with refused("index-outside", says="2"):
         primitive(two, 2)
-    with pytest.raises(PoiseError, match=r"\(4, 2\)"):
+    with refused("policy-unfit", says="(4, 2)"):
         Trainer(Bandit(8), TOY, warm_start=two)
 
 
@@ -272,5 +272,5 @@ def test_stages_of_old_files_are_read(tmp_path: Path):
     assert torch.equal(load_policy(tmp_path / "p").act(OBS), plain.act(OBS))
     plain.shape["kind"] = "oracle"
     plain.save(tmp_path / "q")
-    with pytest.raises(PoiseError, match="kind 'oracle' is unknown"):
+    with refused("unknown-choice", says="oracle"):
         load_policy(tmp_path / "q")

@@ -20,7 +20,6 @@ from chromium import CHROMIUM, opened
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.live.commands import MOST_BYTES, LiveConfig
@@ -28,6 +27,7 @@ from poise.live.page.server import HEAD, PAGES, PageServer, as_json, packed
 from poise.live.session import Session, Wanted
 from poise.live.sockets import A_SECOND, EACH, Guard
 from poise.live.stream import Inbox
+from refusals import refused
 from test_docs import WALK
 
 
@@ -196,7 +196,7 @@ def test_others_need_the_token() -> None:
 
 
 def test_a_port_that_is_taken_is_told(served: Served) -> None:
-    with pytest.raises(PoiseError, match="cannot listen"):
+    with refused("cannot-listen"):
         PageServer(Guard("127.0.0.1", served.guard.port), {}, Inbox(), print, dict, time.monotonic)
 
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.kinematics import clip_to_qpos
 from poise.live.record import Recorder
+from refusals import refused
 
 
 def recorder(path: Path, count: int = 1) -> Recorder:
@@ -52,7 +52,7 @@ def test_a_recording_reads_back(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_format_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(PoiseError):
+    with refused("format-not-written"):
         recorder(tmp_path / "take.xyz")
 
 

@@ -13,6 +13,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.motion.rotations import euler_to_quat
+from refusals import refused
 from toy_human import human, swing
 
 
@@ -76,30 +77,29 @@ def test_faults_are_told_with_joint_and_frame():
     assert "got (4, 3) and (3, 3, 4)" in broken(root_pos=np.zeros((4, 3)))
     for fps in (0.0, -30.0, math.nan, math.inf, 1e-3, 2001.0, 1e300):
         assert "frame rate must be from 0.1 to 2000 per second, got" in broken(fps=fps)
-    with pytest.raises(PoiseError, match="the clip has 1 frame; motion needs at least 2"):
+    with refused("clip-too-short", says="1"):
         still(1)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"names": ("a", "b", "a")}, "joint name 'a' appears twice"),
-        ({"parents": (-1, 0)}, "got 3 names, 2 parents"),
-        ({"parents": (0, 0, 1)}, "joint 'root' has parent index 0"),
-        ({"parents": (-1, 2, 0)}, "joint 'upper' has parent index 2"),
-        ({"parents": (-1, -1, 0)}, "joint 'upper' has parent index -1"),
-        ({"offsets": np.full((3, 3), np.nan)}, "joint 'root' has an offset that is not finite"),
-        ({"offsets": np.zeros((3, 2))}, "offsets of shape (3, 2)"),
+        ({"names": ("a", "b", "a")}, ("name-repeated", "a")),
+        ({"parents": (-1, 0)}, ("count-differs", ("3", "2"))),
+        ({"parents": (0, 0, 1)}, ("parent-order", ("root", "0"))),
+        ({"parents": (-1, 2, 0)}, ("parent-order", ("upper", "2"))),
+        ({"parents": (-1, -1, 0)}, ("parent-order", ("upper", "-1"))),
+        ({"offsets": np.full((3, 3), np.nan)}, ("not-finite", "root")),
+        ({"offsets": np.zeros((3, 2))}, ("count-differs", "3, 2")),
     ],
 )
 def test_skeletons_are_checked(changes, message):
-    with pytest.raises(PoiseError) as error:
+    with refused(*message):
         replace(arm(), **changes)
-    assert message in str(error.value)
 
 
 def test_an_empty_skeleton_is_refused():
-    with pytest.raises(PoiseError, match="at least one joint"):
+    with refused("no-joints"):
         Skeleton((), (), np.zeros((0, 3)))
 
 
@@ -107,7 +107,7 @@ def test_skeletons_answer():
     skeleton = replace(arm(), ends=((2, (0.0, 0.0, 0.5)),))
     assert skeleton.index("lower") == 2 and skeleton.children(0) == (1,) and len(skeleton) == 3
     np.testing.assert_array_equal(skeleton.rest_positions(), [[0, 0, 0], [0, 0, 1], [2, 0, 1]])
-    with pytest.raises(PoiseError, match=r"no joint 'lowr'. Did you mean 'lower'\?"):
+    with refused("unknown-joint", says=("lowr", "lower")):
         skeleton.index("lowr")
 
 
@@ -152,13 +152,13 @@ def test_bone_lengths_may_differ_but_hierarchies_not():
     ClipLibrary((swing(), swing(scale=1.2, name="tall")))
     skeleton = human()
     renamed = replace(skeleton, names=("pelvis", *skeleton.names[1:]))
-    with pytest.raises(PoiseError, match="odd: its joints differ from those of 'swing'"):
+    with refused("skeleton-differs", says=("odd", "swing")):
         ClipLibrary((swing(), swing(name="odd").replaced(skeleton=renamed)))
-    with pytest.raises(PoiseError, match="at least one clip"):
+    with refused("no-clips"):
         ClipLibrary(())
 
 
 @pytest.mark.parametrize("weights", [(1.0,), (1.0, -1.0), (0.0, 0.0), (1.0, 1.0, 1.0)])
 def test_wrong_weights_are_told(weights):
-    with pytest.raises(PoiseError, match="a library of 2 clips needs as many weights"):
+    with refused("bad-weights", says="2"):
         ClipLibrary((swing(), swing(name="b")), weights)

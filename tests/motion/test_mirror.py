@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
-from poise.errors import PoiseError
 from poise.motion.windows import joined, mirrored, mirrored_clip, other_sides
+from refusals import refused
 from toy_human import swing
 from toy_windows import bank
 
@@ -20,7 +19,7 @@ def test_each_side_finds_the_other() -> None:
     assert torch.equal(other[other], torch.arange(len(of.names)))
     swapped = {of.names[j] for j in range(len(of.names)) if int(other[j]) != j}
     assert swapped and all("left" in n.lower() or "right" in n.lower() for n in swapped)
-    with pytest.raises(PoiseError, match="tells left from right"):
+    with refused("sides-unknown"):
         other_sides(("a", "b"), (-1, 0))
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import pytest
 import torch
 
 from poise.env import ImitationEnv
-from poise.errors import PoiseError
 from poise.plan import Expert, ExpertConfig, make_plan
+from refusals import refused
 from toy_human import swing
 
 N = 4
@@ -87,7 +86,7 @@ def test_without_the_root_among_the_helped_bodies_there_is_no_expert(make_env: M
     env, _ = started(make_env, method="rfc-explicit")
     assert env.task.residual is not None
     env.task = replace(env.task, residual=replace(env.task.residual, bodies=(3,)))  # type: ignore[arg-type]
-    with pytest.raises(PoiseError, match="residual force on the root"):
+    with refused("residual-force-missing"):
         Expert(env)
 
 

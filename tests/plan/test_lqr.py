@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from poise.errors import PoiseError
 from poise.plan.lqr import Regulator, regulate
+from refusals import refused
 
 N, M = 4, 2
 
@@ -91,5 +91,5 @@ def test_damping_shortens_the_step() -> None:
 
 def test_lengths_must_fit() -> None:
     p = problem((5,)) | {"lengths": np.array([4])}
-    with pytest.raises(PoiseError, match="4 rows, and 5"):
+    with refused("count-differs", says=("4", "5")):
         regulate(**p)

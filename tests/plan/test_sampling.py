@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
@@ -17,6 +16,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.track.recovering import look_for, replay
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.plan import SamplingConfig
+from refusals import refused
 from toy_policy import toy_run, walk
 
 FEW = SamplingConfig(characters=32, retries=1)
@@ -94,13 +94,13 @@ def test_the_critic_goes_with_the_policy(tracker: Tracker, tmp_path: Path) -> No
 
 
 def test_bad_settings_are_refused() -> None:
-    with pytest.raises(PoiseError, match="4 characters"):
+    with refused("out-of-range", says="4 characters"):
         SamplingConfig(characters=4)
-    with pytest.raises(PoiseError, match="must be positive"):
+    with refused("out-of-range"):
         SamplingConfig(noise_range=(0.3, 0.1))
-    with pytest.raises(PoiseError, match="searched for a single character"):
+    with refused("single-character-only"):
         TrackConfig(controller="search", count=2)
-    with pytest.raises(PoiseError, match="one that comes or is put back"):
+    with refused("single-character-only"):
         TrackConfig(controller="search", recover=True)
 
 

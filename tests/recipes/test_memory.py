@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from poise.errors import PoiseError
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation, check_memory, free_bytes, learner_bytes
+from refusals import refused
 from toy_human import swing
 
 
@@ -34,9 +34,7 @@ def test_free_memory_is_the_least_that_is_known(machine: Path):
 def test_what_fits_passes_and_what_does_not_is_told():
     check_memory(80, 10, 1000)
     check_memory(10**9, 10, None)
-    with pytest.raises(
-        PoiseError, match=r"81 characters .* 0.0 GB are free.* At most 80 fit: use --envs 80"
-    ):
+    with refused("out-of-memory", says=("81", "--envs 80")):
         check_memory(81, 10, 1000)
     assert learner_bytes(2, 10, 3) == 2 * (60 + 24 + 48) + 160
 
@@ -44,7 +42,7 @@ def test_what_fits_passes_and_what_does_not_is_told():
 def test_a_trainer_of_millions_is_refused_before_anything_is_made(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("poise.recipes.imitation.free_bytes", lambda: 10**9)
     task: Imitation = build(swing(), ResidualForce(num_envs=5_000_000))
-    with pytest.raises(PoiseError, match="5,000,000 characters would take about") as told:
+    with refused("out-of-memory", says="5,000,000") as told:
         task.trainer()
     fit = int(str(told.value).split("--envs ")[1].rstrip("."))
     # Some tens of kilobytes each.

@@ -11,7 +11,6 @@ import torch
 from poise.body import BodyConfig
 from poise.control import ExplicitResidual, ImplicitResidual, SuccessHelp
 from poise.env import rewards as reward
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate
@@ -22,6 +21,7 @@ from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import config_of, most_help, schedule, task
 from poise.score import Nothing, run_episodes, start_frames
 from poise.sim.mjcf import write_mjcf
+from refusals import refused
 from toy_human import swing, trembling
 
 #: A setting, a value, and the term that this value brings in and that is not there by default.
@@ -119,11 +119,11 @@ def test_a_run_folder_rebuilds_the_task(tmp_path):
     assert torch.equal(again.reference.qpos, first.reference.qpos)
     assert again.reference.cyclic.tolist() == [True, False]
     begin(tmp_path, library, config)  # The same again is no conflict.
-    with pytest.raises(PoiseError, match="holds a run with other settings"):
+    with refused("settings-differ"):
         begin(tmp_path, library, replace(config, seed=6))
-    with pytest.raises(PoiseError, match=r"holds a run of other clips \(walk, short\)"):
+    with refused("clips-differ", says="walk, short"):
         begin(tmp_path, ClipLibrary((swing(),)), config)
-    with pytest.raises(PoiseError, match="there is no such file or folder"):
+    with refused("file-missing"):
         _ = open_run(tmp_path / "nowhere").task
 
 
@@ -185,7 +185,7 @@ def test_what_is_learned_has_no_noise_in_any_joint_and_that_is_judged_once(tmp_p
     # That is another run, but for a run of a version that did not know the word.
     folder, library = tmp_path / "run", ClipLibrary.of([shaken])
     begin(folder, library, ResidualForce(num_envs=2))
-    with pytest.raises(PoiseError, match="holds a run of other clips"):
+    with refused("clips-differ"):
         begin(folder, ClipLibrary.of([raw]), ResidualForce(num_envs=2))
     tensors, meta = load_checkpoint(folder / "run.safetensors")
     del meta["clips"][0]["source"]["raw"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from poise.errors import PoiseError
 from poise.motion import Skeleton
 from poise.motion.rotations import (
     axis_angle_to_quat,
@@ -19,6 +18,7 @@ from poise.motion.windows import foot_joints
 from poise.synthesis.filler import check_keyframes, split_gaps
 from poise.synthesis.footsteps import lock_feet
 from poise.synthesis.limits import fade, meet, sampled
+from refusals import refused
 from toy_human import swing, turn
 
 
@@ -96,13 +96,13 @@ def test_other_rates_run_through_every_frame() -> None:
 def test_keyframes_that_make_no_sense_are_told_apart() -> None:
     assert check_keyframes((0, 30, 45), 50) == (0, 30, 45)
     for keys, words in (
-        ((3,), "at least 2"),
-        ((0, 50), "keyframe 50 is out of range"),
-        ((-1, 5), "keyframe -1 is out of range"),
-        ((0, 7, 7), "keyframe 7 is given twice"),
-        ((0, 9, 7), "keyframe 7 comes after 9"),
+        ((3,), ("too-few-keyframes",)),
+        ((0, 50), ("frame-outside", "50")),
+        ((-1, 5), ("frame-outside", "-1")),
+        ((0, 7, 7), ("keyframe-repeated", "7")),
+        ((0, 9, 7), ("not-rising", ("7", "9"))),
     ):
-        with pytest.raises(PoiseError, match=words):
+        with refused(*words):
             check_keyframes(keys, 50)
 
 

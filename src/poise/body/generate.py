@@ -49,11 +49,20 @@ class BodyConfig:
 
     def __post_init__(self) -> None:
         if self.preset not in ("auto", "cmu-rfc", "generic"):
-            raise PoiseError(f"body preset must be auto, cmu-rfc or generic, got '{self.preset}'")
+            raise PoiseError(
+                f"body preset must be auto, cmu-rfc or generic, got '{self.preset}'",
+                code="unknown-choice",
+            )
         if self.mass_kg is not None and not 2.0 <= self.mass_kg <= 5000.0:
-            raise PoiseError(f"the mass must lie between 2 and 5000 kg, got {self.mass_kg:g}")
+            raise PoiseError(
+                f"the mass must lie between 2 and 5000 kg, got {self.mass_kg:g}", code="out-of-range"
+            )
         if self.mass_kg is not None and self.mjcf is not None:
-            raise PoiseError("a body of your own has its own mass; state one or the other", self.mjcf)
+            raise PoiseError(
+                "a body of your own has its own mass; state one or the other",
+                self.mjcf,
+                code="settings-conflict",
+            )
 
 
 def generate_table(

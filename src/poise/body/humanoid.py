@@ -77,7 +77,9 @@ class Humanoid:
         rows = self.table.rows
         sides = {rows[i].side: i + 1 for i in self.rows_of("thigh")}
         if not {"left", "right"} <= sides.keys():
-            raise PoiseError("the body has no two thighs, between which its left is", "Humanoid")
+            raise PoiseError(
+                "the body has no two thighs, between which its left is", "Humanoid", code="role-missing"
+            )
         import mujoco
 
         data = mujoco.MjData(self.model)
@@ -176,5 +178,6 @@ def make_humanoid(skeleton: Skeleton, table: BodyTable) -> Humanoid:
                 f"row {i} of the body table is '{row.name}', but MuJoCo's body {i + 1} is "
                 f"'{model.body(i + 1).name}'",
                 hint="Order the rows depth first",
+                code="body-table-order",
             )
     return Humanoid(skeleton, table, model)

@@ -45,7 +45,7 @@ def check_mjcf(path: Path) -> int:
         if file.resolve() in roots:
             continue
         if len(roots) == MOST_FILES:
-            raise PoiseError(f"it is made of more than {MOST_FILES} files", path)
+            raise PoiseError(f"it is made of more than {MOST_FILES} files", path, code="over-limit")
         check_file(file, MOST_BYTES)
         root = roots[file.resolve()] = _tree(file)
         for element in root.iter():
@@ -61,7 +61,11 @@ def check_mjcf(path: Path) -> int:
             assets |= {_inside(named, inner, path, folder) for inner in dirs}
     size = sum(file.stat().st_size for file in assets | set(roots) if file.is_file())
     if size > MOST_BYTES:
-        raise PoiseError(f"its files have {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f}", path)
+        raise PoiseError(
+            f"its files have {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f}",
+            path,
+            code="file-too-big",
+        )
     return size
 
 
@@ -77,6 +81,7 @@ def _inside(named: str, inner: str, file: Path, folder: Path) -> Path:
             f"it names a file outside its folder ({shown(Path(inner) / named)})",
             file,
             "Copy what it needs beside it and name it from there",
+            code="outside-folder",
         )
     return found
 
@@ -84,7 +89,9 @@ def _inside(named: str, inner: str, file: Path, folder: Path) -> Path:
 def _check_element(element: ElementTree.Element, file: Path) -> None:
     """Refuses plug-ins and elements that make more than a body needs."""
     if element.tag in ("extension", "plugin"):
-        raise PoiseError("it loads plug-ins, which can run any code", file, "Leave them out")
+        raise PoiseError(
+            "it loads plug-ins, which can run any code", file, "Leave them out", code="content-refused"
+        )
     for name, most in (("count", MOST_COPIES), ("nkey", MOST_COPIES), ("nuserdata", MOST_MADE)):
         if element.tag in ("replicate", "composite", "size") or name == "count":
             _bound(element, (name,), most, file)
@@ -101,7 +108,9 @@ def _bound(element: ElementTree.Element, names: tuple[str, ...], most: int, file
             return
     if not (math.isfinite(made) and made <= most):
         what = f"its <{shown(element.tag)[1:-1]}> makes {made:.3g} with {' and '.join(names)}"
-        raise PoiseError(f"{what}, more than the {most} allowed", file, "Leave it out")
+        raise PoiseError(
+            f"{what}, more than the {most} allowed", file, "Leave it out", code="over-limit"
+        )
 
 
 def _tree(file: Path) -> ElementTree.Element:
@@ -109,18 +118,22 @@ def _tree(file: Path) -> ElementTree.Element:
     try:
         text = file.read_bytes()
         if re.search(rb"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-            raise PoiseError("it declares entities, which no body needs", file)
+            raise PoiseError("it declares entities, which no body needs", file, code="content-refused")
         for event, element in ElementTree.iterparse(file, ("start", "end")):
             depth += 1 if event == "start" else -1
             count, root = count + 1, element if root is None else root
             if depth > MOST_DEEP:
-                raise PoiseError(f"its elements lie more than {MOST_DEEP} deep", file)
+                raise PoiseError(
+                    f"its elements lie more than {MOST_DEEP} deep", file, code="nested-too-deep"
+                )
             if count > 2 * MOST_ELEMENTS:
-                raise PoiseError(f"it has more than {MOST_ELEMENTS} elements", file)
+                raise PoiseError(f"it has more than {MOST_ELEMENTS} elements", file, code="over-limit")
     except (ElementTree.ParseError, ExpatError, ValueError, LookupError, OSError) as problem:
-        raise PoiseError(f"MuJoCo cannot read it: {shown(problem)}", file) from None
+        raise PoiseError(
+            f"MuJoCo cannot read it: {shown(problem)}", file, code="mjcf-unreadable"
+        ) from None
     if root is None:
-        raise PoiseError("it is empty", file)
+        raise PoiseError("it is empty", file, code="file-empty")
     return root
 
 
@@ -167,7 +180,7 @@ def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
     """
     path = Path(path)
     if not path.is_file():
-        raise PoiseError("there is no such file", str(path))
+        raise PoiseError("there is no such file", str(path), code="file-missing")
     try:
         made = read_limited(_SCRIPT, path, check_mjcf(path), "MJCF file", "Make it smaller")
     except PoiseError as problem:
@@ -198,7 +211,10 @@ class _Reader:
         free = [int(self.model.jnt_bodyid[j]) for j in np.flatnonzero(self.model.jnt_type == _FREE)]
         if not free:
             raise PoiseError(
-                "it has no free root", self.path, "Give the pelvis a <freejoint/> so that it can move"
+                "it has no free root",
+                self.path,
+                "Give the pelvis a <freejoint/> so that it can move",
+                code="no-free-root",
             )
         # Of several free bodies (balls, boxes) the character is the one with most bodies below it.
         return max(free, key=lambda b: int((self.model.body_rootid == b).sum()))
@@ -219,9 +235,14 @@ class _Reader:
                     f"joint '{self.model.joint(j).name}' of body '{name}' is a {kind} joint",
                     self.path,
                     "Use up to three hinges at right angles in its place",
+                    code="joint-unsupported",
                 )
         if len(hinges) > 3:
-            raise PoiseError(f"body '{name}' has {len(hinges)} hinges, at most 3 can be used", self.path)
+            raise PoiseError(
+                f"body '{name}' has {len(hinges)} hinges, at most 3 can be used",
+                self.path,
+                code="joint-unsupported",
+            )
         if not hinges:
             return
         anchors, axes = self.data.xanchor[hinges], self.data.xaxis[hinges]
@@ -230,11 +251,14 @@ class _Reader:
             raise PoiseError(
                 f"the hinges of body '{name}' lie {apart * 1000:.0f} mm apart and cannot be one joint",
                 self.path,
+                code="joint-unsupported",
             )
         skew = math.degrees(math.asin(min(1.0, np.abs(axes @ axes.T - np.eye(len(hinges))).max())))
         if skew > SKEW_DEG:
             raise PoiseError(
-                f"the hinges of body '{name}' are {skew:.0f} degrees off right angles", self.path
+                f"the hinges of body '{name}' are {skew:.0f} degrees off right angles",
+                self.path,
+                code="joint-unsupported",
             )
         if apart > 1e-3 or skew > 1.0:
             self.notes.append(
@@ -295,7 +319,9 @@ class _Reader:
             numbers = PARTS[part.kind] if part else _OTHER
             if part and part.kind == "pelvis" and i:
                 raise PoiseError(
-                    f"the pelvis '{self._name(b)}' is not the body with the free joint", self.path
+                    f"the pelvis '{self._name(b)}' is not the body with the free joint",
+                    self.path,
+                    code="no-free-root",
                 )
             order, frame = _axes(self.data.xaxis[hinges])
             kp, torque = self._gains(hinges, numbers, strength)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 
-def read(path: str, refuse: Callable[[str], None]) -> dict[str, np.ndarray]:
+def read(path: str, refuse: Callable[..., None]) -> dict[str, np.ndarray]:
     """The compiled model as bytes."""
     import mujoco
 
@@ -21,7 +21,7 @@ def read(path: str, refuse: Callable[[str], None]) -> dict[str, np.ndarray]:
             model = mujoco.MjSpec.from_file(path).compile()
         except (ValueError, OSError) as problem:
             said = " ".join(str(problem).split()).removeprefix("Error: ")
-            refuse(f"MuJoCo cannot read it: {said}")
+            refuse(f"MuJoCo cannot read it: {said}", code="mjcf-unreadable")
             raise
         mujoco.mj_saveModel(model, "model.mjb")
         os.chdir("/")

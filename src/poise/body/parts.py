@@ -157,6 +157,7 @@ def _check_apart(
                         f"joint '{skeleton.names[j]}' is the {own} by its name and the {other} by its "
                         "place in the tree",
                         skeleton.source.path,
+                        code="role-conflict",
                     )
 
 
@@ -173,6 +174,7 @@ def _missing(roles: Roles, legs: _Lines, arms: _Lines) -> PoiseError:
                 f"no {label} was found among the joints {', '.join(skeleton.names)}",
                 skeleton.source.path,
                 f"Name the joint '{name}' or similar",
+                code="role-missing",
             )
     for what, found, end in (("leg", legs, "foot"), ("arm", arms, "hand")):
         both = [ends[f"{side} {end}"] for side in _SIDES]
@@ -184,8 +186,9 @@ def _missing(roles: Roles, legs: _Lines, arms: _Lines) -> PoiseError:
                     f"the {side} {what} has {len(line)} joints "
                     f"({', '.join(skeleton.names[j] for j in line)}) and needs at least 3",
                     skeleton.source.path,
+                    code="limb-too-short",
                 )
-    return PoiseError("the skeleton is no human's", skeleton.source.path)
+    return PoiseError("the skeleton is no human's", skeleton.source.path, code="not-human")
 
 
 def _longest(skeleton: Skeleton, line: Sequence[int], most: int) -> list[int]:

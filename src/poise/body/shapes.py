@@ -49,7 +49,9 @@ class Ruler:
             ]
         )
         if not leg > 1e-3:
-            raise PoiseError(f"the legs are {leg * 1000:.1f} mm long", skeleton.source.path)
+            raise PoiseError(
+                f"the legs are {leg * 1000:.1f} mm long", skeleton.source.path, code="limb-too-short"
+            )
         height = float(leg) * presets.HEIGHT_PER_LEG
         frames = _neutral_frames(anatomy, links)
         hips = [links[j][1] for j in (*anatomy.of("thigh", "left"), *anatomy.of("thigh", "right"))]

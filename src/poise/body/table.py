@@ -99,7 +99,9 @@ class BodyTable:
         """Row of the body called `name`."""
         names = tuple(r.name for r in self.rows)
         if name not in names:
-            raise PoiseError(f"there is no body '{name}'. {did_you_mean(name, names)}")
+            raise PoiseError(
+                f"there is no body '{name}'. {did_you_mean(name, names)}", code="unknown-body"
+            )
         return names.index(name)
 
     def overridden(self, changes: Mapping[str, float]) -> BodyTable:
@@ -112,7 +114,9 @@ class BodyTable:
         fields = ("mass", "kp", "kd", "torque", "armature")
         for key, value in changes.items():
             if not math.isfinite(value) or value < 0:
-                raise PoiseError(f"'{key}' must be a number of at least 0, got {value}")
+                raise PoiseError(
+                    f"'{key}' must be a number of at least 0, got {value}", code="out-of-range"
+                )
             if key == "friction":
                 table = replace(table, friction=float(value))
                 continue
@@ -121,7 +125,8 @@ class BodyTable:
             if what not in fields or not name:
                 raise PoiseError(
                     f"'{key}' is no parameter of a body; write BODY.FIELD with FIELD one of "
-                    f"{', '.join(fields)}"
+                    f"{', '.join(fields)}",
+                    code="unknown-setting",
                 )
             if name not in kinds:
                 table.index(name)

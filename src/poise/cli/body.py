@@ -40,7 +40,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     config, out = options.body.config(), options.out
     if out is not None:
         if out.suffix.lower() != ".xml":
-            raise PoiseError("a body is written as MJCF, in a file .xml", out, "Give -o FILE.xml")
+            raise PoiseError(
+                "a body is written as MJCF, in a file .xml", out, "Give -o FILE.xml", code="wrong-suffix"
+            )
         own = () if options.body.body is None else (options.body.body,)
         may_write(out, options.force, options.clip, *own)
     from poise.kinematics import fit_humanoid

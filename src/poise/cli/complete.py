@@ -90,7 +90,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     every = o.keyframes == "all"
     if every and o.times is None:
         raise PoiseError(
-            "--keyframes all leaves nothing to fill", hint="Say when with --times 0,1.2,2.5"
+            "--keyframes all leaves nothing to fill",
+            hint="Say when with --times 0,1.2,2.5",
+            code="nothing-to-fill",
         )
     keys = () if every else frames_of(o.keyframes)
     check_range("adapt", o.adapt, 0, 1000)
@@ -169,7 +171,11 @@ def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
     if o.partial or o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
-        raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
+        raise PoiseError(
+            "--kinematic has no body to direct or to wait for",
+            hint="Leave it out",
+            code="option-not-applicable",
+        )
     from poise.formats import check_writable, names_file, write_clip
     from poise.jobs.inbetween.fill import inbetween
     from poise.synthesis.filler import check_keyframes

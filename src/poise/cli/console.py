@@ -179,7 +179,9 @@ def document(
     """The document of `--json`, the same for every verb; numbers that are not finite become null."""
     from poise.settings import plain
 
-    told = None if error is None else {"what": error.what, "where": error.where, "hint": error.hint}
+    told = None
+    if error is not None:
+        told = {"code": error.code, "what": error.what, "where": error.where, "hint": error.hint}
     return plain(
         {
             "poise": __version__,
@@ -200,18 +202,25 @@ def failure(problem: BaseException) -> tuple[int, PoiseError]:
     if isinstance(problem, PoiseError):
         return REFUSED, problem
     if isinstance(problem, KeyboardInterrupt):
-        return INTERRUPTED, PoiseError("interrupted")
+        return INTERRUPTED, PoiseError("interrupted", code="interrupted")
     if isinstance(problem, OSError) and (problem.filename is not None or problem.errno in _DISK):
         return REFUSED, of_path(problem)
     if isinstance(problem, MemoryError):
-        return 1, PoiseError("there is not enough memory; use fewer --envs or a shorter clip")
+        return 1, PoiseError(
+            "there is not enough memory; use fewer --envs or a shorter clip", code="out-of-memory"
+        )
     said = f": {problem}" if str(problem) else ""
     hint = "This is a fault of Poise; set POISE_DEBUG=1 and run again for the traceback"
-    return 1, PoiseError(f"unexpected {type(problem).__name__}{said}", hint=hint)
+    return 1, PoiseError(f"unexpected {type(problem).__name__}{said}", hint=hint, code="internal-fault")
 
 
 def of_path(problem: OSError) -> PoiseError:
     """A failed access to a path of the user's, in one sentence."""
     reason = (problem.strerror or os.strerror(problem.errno or 0)).lower()
     hint = "Free some space" if problem.errno in _DISK[:2] else "Choose a path that can be used"
-    return PoiseError(f"cannot be read or written ({reason})", problem.filename or "the disk", hint)
+    return PoiseError(
+        f"cannot be read or written ({reason})",
+        problem.filename or "the disk",
+        hint,
+        code="path-unusable",
+    )

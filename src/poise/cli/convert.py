@@ -74,10 +74,12 @@ def _span(words: str, frames: int, where: Path) -> tuple[int, int]:
     try:
         first, last = (int(w) for w in words.split("-"))
     except ValueError:
-        raise PoiseError(f"--frames '{words}' makes no sense", hint="Write --frames 30-240") from None
+        raise PoiseError(
+            f"--frames '{words}' makes no sense", hint="Write --frames 30-240", code="option-malformed"
+        ) from None
     if not 0 <= first < last < frames:
         what = f"--frames must rise within 0 to {frames - 1}, got {words}"
-        raise PoiseError(what, where, "Two frames are the fewest")
+        raise PoiseError(what, where, "Two frames are the fewest", code="frame-outside")
     return first, last
 
 
@@ -86,5 +88,9 @@ def target_of(options: Options) -> Path:
     given = [x for x in (options.target, options.out) if x is not None]
     if len(given) != 1:
         what = "OUT is given twice" if given else "poise convert needs OUT"
-        raise PoiseError(what, hint="Write poise convert IN OUT, or poise convert IN -o OUT")
+        raise PoiseError(
+            what,
+            hint="Write poise convert IN OUT, or poise convert IN -o OUT",
+            code="option-repeated" if given else "argument-missing",
+        )
     return given[0]

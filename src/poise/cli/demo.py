@@ -54,7 +54,12 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     training.check(whole.recipe_settings)
     held = o.out / "run"
     if held.exists() and not o.force:
-        raise PoiseError("already holds a run", o.out, "Choose another folder with -o, or use --force")
+        raise PoiseError(
+            "already holds a run",
+            o.out,
+            "Choose another folder with -o, or use --force",
+            code="run-exists",
+        )
     may_deliver(o.out, None, o.force, WALK)
     if held.exists():
         _remove(held)
@@ -70,5 +75,7 @@ def _remove(held: Path) -> None:
     from poise.jobs.run_file import RUN_FILE
 
     if not (held / RUN_FILE).is_file() or held.is_symlink():
-        raise PoiseError("is there and is no run", held, "Choose another folder with -o")
+        raise PoiseError(
+            "is there and is no run", held, "Choose another folder with -o", code="not-a-run"
+        )
     shutil.rmtree(held)

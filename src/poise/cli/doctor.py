@@ -82,7 +82,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         with contextlib.nullcontext() if folder is None else claimed(folder):
             return each("doctor", (options.clip,), folder, one)
     if options.fix or options.rest_pose or options.out is not None:
-        raise PoiseError("no clip was given", hint="Write poise doctor CLIP --fix -o OUT")
+        raise PoiseError(
+            "no clip was given", hint="Write poise doctor CLIP --fix -o OUT", code="argument-missing"
+        )
     checks = [check() for check in CHECKS]
     ready = all(c.state != "missing" for c in checks)
     wide = max(len(c.name) for c in checks)
@@ -240,11 +242,19 @@ def run_on(path: Path, options: Options) -> Answer:
     from poise.kinematics import examine, heal
 
     if options.path != "auto" and not fix:
-        raise PoiseError("--path needs --fix", hint=f"Write poise doctor {path} --fix -o OUT")
+        raise PoiseError(
+            "--path needs --fix",
+            hint=f"Write poise doctor {path} --fix -o OUT",
+            code="option-needs-option",
+        )
     if (fix or rest) != (target is not None):
         asked = "--fix" if fix or not rest else "--rest-pose"
         hint = f"Write poise doctor {path} {asked} -o OUT"
-        raise PoiseError(f"{asked} needs -o OUT" if fix or rest else "-o OUT needs --fix", hint=hint)
+        raise PoiseError(
+            f"{asked} needs -o OUT" if fix or rest else "-o OUT needs --fix",
+            hint=hint,
+            code="option-needs-option",
+        )
     if target is not None:
         check_writable(target)
         may_write(target, options.force, path)

@@ -146,10 +146,14 @@ def targets_of(text: str) -> tuple[tuple[float, float], ...]:
             x, y = map(float, word.split(","))
         except ValueError:
             what = f"'{word[:40]}' is no point" + ("" if "," in word else ", and no such file is there")
-            raise PoiseError(what, where, "Write X,Y in m, such as 5,0") from None
+            raise PoiseError(
+                what, where, "Write X,Y in m, such as 5,0", code="option-malformed"
+            ) from None
         out.append((x, y))
     if not 1 <= len(out) <= MOST_TARGETS:
-        raise PoiseError(f"there must be 1 to {MOST_TARGETS:,} points, got {len(out)}", where)
+        raise PoiseError(
+            f"there must be 1 to {MOST_TARGETS:,} points, got {len(out)}", where, code="out-of-range"
+        )
     return tuple(out)
 
 

@@ -44,7 +44,12 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_device(o.device)
     if o.rollouts is not None:
         if o.rollouts.suffix != ".npz":
-            raise PoiseError("rollouts are written as .npz", o.rollouts, "Give --rollouts FILE.npz")
+            raise PoiseError(
+                "rollouts are written as .npz",
+                o.rollouts,
+                "Give --rollouts FILE.npz",
+                code="wrong-suffix",
+            )
         may_write(o.rollouts, o.force)
     from poise.jobs.open import open_run
 

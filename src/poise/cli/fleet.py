@@ -65,7 +65,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     """Exit code 0 if every job is done, 1 if one has failed, 130 after Ctrl-C."""
     o = options
     if o.workers < 0:
-        raise PoiseError(f"--workers must be a whole number of at least 0, got {o.workers}")
+        raise PoiseError(
+            f"--workers must be a whole number of at least 0, got {o.workers}", code="out-of-range"
+        )
     jobs = plan(o)
     for job in jobs:
         _check(job)
@@ -126,9 +128,13 @@ def _setting(text: str) -> tuple[str, list[str]]:
     listed = [v.strip() for v in values.split(",") if v.strip()]
     if not equals or not name or not listed:
         hint = "Write for example --set help-limit=0,50,100"
-        raise PoiseError(f"--set needs NAME=VALUE or NAME=V,V,..., got '{text}'", hint=hint)
+        raise PoiseError(
+            f"--set needs NAME=VALUE or NAME=V,V,..., got '{text}'", hint=hint, code="option-malformed"
+        )
     if name in _TAKEN:
-        raise PoiseError(f"--set cannot set {name}", hint=f"Use {_TAKEN[name]}")
+        raise PoiseError(
+            f"--set cannot set {name}", hint=f"Use {_TAKEN[name]}", code="option-not-applicable"
+        )
     return name, listed
 
 
@@ -136,7 +142,9 @@ def _seeds(text: str) -> list[int]:
     parts = [p.strip() for p in text.split(",") if p.strip()]
     if not parts or not all(p.isdecimal() for p in parts) or len(set(parts)) != len(parts):
         hint = "Write for example --seeds 0,1,2"
-        raise PoiseError(f"--seeds needs different whole numbers, got '{text}'", hint=hint)
+        raise PoiseError(
+            f"--seeds needs different whole numbers, got '{text}'", hint=hint, code="option-malformed"
+        )
     return [int(p) for p in parts]
 
 

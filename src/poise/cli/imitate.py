@@ -100,7 +100,9 @@ def from_nothing(o: Options, run: Path) -> bool:
     policy = o.going_on not in (None, NOTHING)
     if recipe and policy:
         what = f"--from goes on with the policy's own settings, and there is {', '.join(sorted(recipe))}"
-        raise PoiseError(what, hint="Leave it out, or train from nothing: --from none")
+        raise PoiseError(
+            what, hint="Leave it out, or train from nothing: --from none", code="option-conflict"
+        )
     if o.training.resume and (run / RUN_FILE).exists():
         return read_run(run).recipe == RECIPE["name"]
     return bool(recipe) or o.going_on == NOTHING or launched()
@@ -114,7 +116,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         return printed(config)
     if o.clip.is_dir():
         hint = "Give one clip, or all of them to poise fleet DIR -o OUT"
-        raise PoiseError("is a folder", o.clip, hint)
+        raise PoiseError("is a folder", o.clip, hint, code="is-folder")
     again = command_line("imitate", argv)
     from poise.jobs.run_file import RUN_FILE
 

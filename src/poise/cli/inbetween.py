@@ -61,7 +61,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     o = options
     keys = frames_of(o.keyframes)
     if not 0 <= o.adapt <= 1000:
-        raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}")
+        raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}", code="out-of-range")
     check_range("samples", o.samples, 1, 100)
     one = o.samples == 1
     outs = [o.out] if one else [o.out.with_stem(f"{o.out.stem}-{k}") for k in range(o.samples)]
@@ -118,4 +118,6 @@ def frames_of(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in text.replace(",", " ").split())
     except ValueError:
         hint = "Write for example --keyframes 0,30,45"
-        raise PoiseError(f"--keyframes needs whole numbers, got '{text}'", hint=hint) from None
+        raise PoiseError(
+            f"--keyframes needs whole numbers, got '{text}'", hint=hint, code="option-malformed"
+        ) from None

@@ -40,7 +40,7 @@ UNITS = {"unit": " m", "ground": " m", "fps": " frames/s"}
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads every file before the first line is printed."""
     if not options.clips:
-        raise PoiseError("no clip was given", hint="Write poise info CLIP")
+        raise PoiseError("no clip was given", hint="Write poise info CLIP", code="argument-missing")
     if any(path.is_dir() for path in options.clips):
         return each("info", options.clips, None, lambda p, _: run(replace(options, clips=(p,)), argv))
     from poise.kinematics import find_faults, find_guesses

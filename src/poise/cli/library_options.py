@@ -46,7 +46,7 @@ class Library:
         """
         if self.library is None:
             hint = f"Write poise train {recipe} --library DIR -o RUNDIR"
-            raise PoiseError(f"the recipe {recipe} needs --library", hint=hint)
+            raise PoiseError(f"the recipe {recipe} needs --library", hint=hint, code="argument-missing")
         for name, text in (
             ("hold-out", self.hold_out),
             ("never", self.never),
@@ -55,7 +55,9 @@ class Library:
             try:
                 re.compile(text or "")
             except re.error as problem:
-                raise PoiseError(f"--{name} is no regular expression ({problem})") from None
+                raise PoiseError(
+                    f"--{name} is no regular expression ({problem})", code="bad-regex"
+                ) from None
         return self.library
 
     def reading(self) -> LibraryConfig:
@@ -69,12 +71,20 @@ class Library:
             except ValueError:
                 rate = math.nan
             if not 0 < rate < 10_000:
-                raise PoiseError(f"--library-fps needs frames per second above 0, got '{text}'")
+                raise PoiseError(
+                    f"--library-fps needs frames per second above 0, got '{text}'",
+                    code="option-malformed",
+                )
             rates.append((pattern, rate))
         skeletons = _pairs("library-skeleton", self.library_skeleton, "cmu-02=02.asf")
         for _, asf in skeletons:
             if not Path(asf).is_file():
-                raise PoiseError("there is no such file", asf, "--library-skeleton names an ASF file")
+                raise PoiseError(
+                    "there is no such file",
+                    asf,
+                    "--library-skeleton names an ASF file",
+                    code="file-missing",
+                )
         back = () if self.backwards is None else (self.backwards,)
         return LibraryConfig(
             skeletons=tuple(skeletons), rates=tuple(rates), mirror=self.mirror, backwards=back
@@ -96,6 +106,8 @@ def _pairs(option: str, texts: tuple[str, ...], example: str) -> list[tuple[str,
         pattern, equals, value = text.rpartition("=")
         if not (equals and pattern and value):
             hint = f"Write for example --{option} {example}"
-            raise PoiseError(f"--{option} needs REGEX=VALUE, got '{text}'", hint=hint)
+            raise PoiseError(
+                f"--{option} needs REGEX=VALUE, got '{text}'", hint=hint, code="option-malformed"
+            )
         out.append((pattern, value))
     return out

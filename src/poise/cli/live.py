@@ -79,7 +79,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("seed", o.seed, 0)
     live_in = o.vmc is not None or o.keypoints is not None or o.stream
     if o.clips and live_in:
-        raise PoiseError("files and a live stream were both given", hint="Leave one of them out")
+        raise PoiseError(
+            "files and a live stream were both given",
+            hint="Leave one of them out",
+            code="option-conflict",
+        )
     from poise.jobs.open import open_run
     from poise.kinematics.travel import find_travel, travelled
     from poise.live.commands import LiveConfig

@@ -115,7 +115,9 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         return Answer()
     verb, rest = argv[0], argv[1:]
     if verb not in VERBS:
-        raise PoiseError(f"there is no command '{verb}'. {did_you_mean(verb, list(VERBS))}")
+        raise PoiseError(
+            f"there is no command '{verb}'. {did_you_mean(verb, list(VERBS))}", code="unknown-verb"
+        )
     from poise.cli.console import notes, say, tell
     from poise.cli.parse import parse
 

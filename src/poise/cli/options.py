@@ -109,7 +109,9 @@ class Reading:
             return float(self.unit)
         except ValueError:
             hint = f"Known names: {', '.join(UNITS)}"
-            raise PoiseError(f"--unit needs metres or a name, got '{self.unit}'", hint=hint) from None
+            raise PoiseError(
+                f"--unit needs metres or a name, got '{self.unit}'", hint=hint, code="unit-unknown"
+            ) from None
 
     def _floor(self) -> float | None:
         """The stated height of the floor in m, None where it is to be guessed or stays."""
@@ -120,7 +122,10 @@ class Reading:
         except ValueError:
             height = math.nan
         if not abs(height) < 1000.0:
-            raise PoiseError(f"--ground needs a height in metres or auto, got '{self.ground}'")
+            raise PoiseError(
+                f"--ground needs a height in metres or auto, got '{self.ground}'",
+                code="option-malformed",
+            )
         return height
 
 
@@ -155,7 +160,7 @@ def check_range(name: str, value: float | None, low: float, high: float = 2**31 
     """Refuses an option --`name` that does not lie in `low` to `high`; None was not given."""
     if value is not None and not low <= value <= high:
         where = f"be at least {low:g}" if high == 2**31 - 1 else f"lie in {low:g} to {high:g}"
-        raise PoiseError(f"--{name} must {where}, got {value}")
+        raise PoiseError(f"--{name} must {where}, got {value}", code="out-of-range")
 
 
 def check_device(name: str) -> None:
@@ -171,11 +176,13 @@ def override(text: str) -> tuple[str, float]:
     name, equals, value = text.partition("=")
     hint = "Write for example --set lfoot.kp=400"
     if not equals or not name.strip():
-        raise PoiseError(f"--set needs NAME=VALUE, got '{text}'", hint=hint)
+        raise PoiseError(f"--set needs NAME=VALUE, got '{text}'", hint=hint, code="option-malformed")
     try:
         number = float(value)
     except ValueError:
-        raise PoiseError(f"--set {name.strip()} needs a number, got '{value}'", hint=hint) from None
+        raise PoiseError(
+            f"--set {name.strip()} needs a number, got '{value}'", hint=hint, code="option-malformed"
+        ) from None
     return name.strip(), number
 
 
@@ -208,10 +215,13 @@ class Training:
     def check(self, chosen: Any) -> None:
         """Refuses numbers that make no sense, before anything is read or made."""
         if not (self.minutes > 0 and math.isfinite(self.minutes)):
-            raise PoiseError(f"--minutes must be above 0, got {self.minutes:g}")
+            raise PoiseError(f"--minutes must be above 0, got {self.minutes:g}", code="out-of-range")
         for name, value in (("limit", chosen.help_limit), ("start", chosen.help_start)):
             if value is not None and not (value >= 0 and math.isfinite(value)):
-                raise PoiseError(f"--help-{name} must be a number of at least 0 newtons, got {value:g}")
+                raise PoiseError(
+                    f"--help-{name} must be a number of at least 0 newtons, got {value:g}",
+                    code="out-of-range",
+                )
         check_range("envs", chosen.num_envs, 1)
         check_range("seed", chosen.seed, 0)
         check_range("threads", self.threads, 0)
@@ -267,7 +277,12 @@ def clips_in(given: Sequence[Path], out: Path | None = None) -> list[tuple[str, 
     found: list[tuple[str, Path]] = []
     for path in given:
         if not path.exists():
-            raise PoiseError("there is no such file or folder", path, "Give a folder of motion files")
+            raise PoiseError(
+                "there is no such file or folder",
+                path,
+                "Give a folder of motion files",
+                code="file-missing",
+            )
         root = path.absolute()
         files = [root] if path.is_file() else sorted(f for f in root.rglob("*") if is_motion(f))
         base = root.parent if path.is_file() else root

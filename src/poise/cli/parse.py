@@ -40,7 +40,7 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
 
     def refuse(event: Any) -> NoReturn:
         what, hint = sentence(event, options, prog)
-        raise PoiseError(what, hint=f"{hint}See {prog} --help")
+        raise PoiseError(what, hint=f"{hint}See {prog} --help", code="command-line")
 
     try:
         does = about(options)
@@ -53,7 +53,7 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
         if stop.code in (0, None):
             raise
         what = "the command line was not understood"
-        raise PoiseError(what, hint=f"See {prog} --help") from None
+        raise PoiseError(what, hint=f"See {prog} --help", code="command-line") from None
 
 
 def _joined_up(argv: Sequence[str]) -> list[str]:

@@ -54,7 +54,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         page = options.out or run.path / "play.html"
         write_report(make_report(run.task, run.episode(clip, frame), run.curve), page)
     if options.open and not webbrowser.open(page.absolute().as_uri()):
-        raise PoiseError("no browser could be opened", page, "Open the page by hand")
+        raise PoiseError("no browser could be opened", page, "Open the page by hand", code="no-browser")
     clip_name = run.task.library.names[clip]
     return Answer({"clip": clip_name, "start": options.start}, {"page": page})
 
@@ -63,12 +63,15 @@ def _place(imitation: Imitation, name: str | None, start: int) -> tuple[int, int
     """Clip index and control frame of frame `start` of the clip called `name`."""
     names = imitation.library.names
     if name is not None and name not in names:
-        raise PoiseError(f"the run has no clip '{name}'. {did_you_mean(name, names)}")
+        raise PoiseError(
+            f"the run has no clip '{name}'. {did_you_mean(name, names)}", code="unknown-clip"
+        )
     index = 0 if name is None else names.index(name)
     clip = imitation.library.clips[index]
     if not 0 <= start < clip.frames:
         raise PoiseError(
-            f"--start must be a frame of '{clip.name}', 0 to {clip.frames - 1}, got {start}"
+            f"--start must be a frame of '{clip.name}', 0 to {clip.frames - 1}, got {start}",
+            code="frame-outside",
         )
     # The clip's frames have the file's rate, the simulation's have the control rate; an episode
     # needs at least one step.

@@ -107,7 +107,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("budget", o.budget, 1, 1_000_000)
     if o.budget is not None and o.controller != "lookahead":
         what = "--budget is for --controller lookahead"
-        raise PoiseError(what, hint="Add --controller lookahead, or leave --budget out")
+        raise PoiseError(
+            what, hint="Add --controller lookahead, or leave --budget out", code="option-needs-option"
+        )
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
     from poise.jobs.open import open_run
@@ -128,9 +130,15 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             learned = None if str(o.learned) == "none" else open_learned(o.learned, tracker)
     if learned is not None and learned.config.scene != o.scene:
         what = f"the run learned the scene '{learned.config.scene}', not '{o.scene}'"
-        raise PoiseError(what, o.learned, f"Write poise play compliant {learned.config.scene}")
+        raise PoiseError(
+            what, o.learned, f"Write poise play compliant {learned.config.scene}", code="scene-differs"
+        )
     if learned is not None and stated:
-        raise PoiseError("a run gives way as it has learned to", hint="Leave --level, --stiffness out")
+        raise PoiseError(
+            "a run gives way as it has learned to",
+            hint="Leave --level, --stiffness out",
+            code="option-not-applicable",
+        )
     with claimed(o.out):
         with working("simulating"):
             more = (o.count, o.duration, o.threads, o.scene, learned, o.controller, how)
@@ -141,7 +149,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     table(f"{o.scene}, {o.count} episodes", ("", "compliant", "without"), rows, left=1)
     say(played.sentence())
     if o.open and not webbrowser.open(paths["report"].absolute().as_uri()):
-        raise PoiseError("no browser could be opened", paths["report"], "Open the page by hand")
+        raise PoiseError(
+            "no browser could be opened", paths["report"], "Open the page by hand", code="no-browser"
+        )
     result = {"scene": o.scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
     return Answer(result, paths, () if given is None else given.notes)
 
@@ -171,7 +181,7 @@ def scene_of(options: Options) -> PlayScene:
     o = options
     if o.scene not in SCENES:
         known = f"{did_you_mean(o.scene, list(SCENES))}"
-        raise PoiseError(f"there is no scene '{o.scene}'", hint=known)
+        raise PoiseError(f"there is no scene '{o.scene}'", hint=known, code="unknown-scene")
     kind: Any = SCENES[o.scene]
     stated: dict[str, Any] = {
         "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
@@ -184,5 +194,9 @@ def scene_of(options: Options) -> PlayScene:
     for name in stated:
         if name not in own:
             option = "--" + name.replace("_", "-")
-            raise PoiseError(f"{option} says nothing of the scene '{o.scene}'", hint="Leave it out")
+            raise PoiseError(
+                f"{option} says nothing of the scene '{o.scene}'",
+                hint="Leave it out",
+                code="option-not-applicable",
+            )
     return kind(**stated)

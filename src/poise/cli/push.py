@@ -146,5 +146,7 @@ def direction_of(text: str | None) -> tuple[float, float, float] | None:
         x, y, z = (float(v) for v in text.split(","))
     except ValueError:
         hint = "Write for example --direction 0,1,0"
-        raise PoiseError(f"--direction needs three numbers, got '{text}'", hint=hint) from None
+        raise PoiseError(
+            f"--direction needs three numbers, got '{text}'", hint=hint, code="option-malformed"
+        ) from None
     return x, y, z

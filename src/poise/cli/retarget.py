@@ -73,10 +73,14 @@ def pairs(texts: Sequence[str]) -> dict[str, str]:
         a, equals, b = (x.strip() for x in text.partition("="))
         if not (equals and a and b):
             raise PoiseError(
-                f"--map needs JOINT=JOINT, got '{text}'", hint="Write --map LeftArm=upperarm_l"
+                f"--map needs JOINT=JOINT, got '{text}'",
+                hint="Write --map LeftArm=upperarm_l",
+                code="option-malformed",
             )
         if out.get(a, b) != b:
-            raise PoiseError(f"--map gives '{a}' both '{out[a]}' and '{b}' to move")
+            raise PoiseError(
+                f"--map gives '{a}' both '{out[a]}' and '{b}' to move", code="joint-mapped-twice"
+            )
         out[a] = b
     return out
 

@@ -172,7 +172,9 @@ def base_of(
     from poise.settings import from_toml
 
     if preset is not None and config is not None:
-        raise PoiseError("--preset and --config both state all settings", hint="Leave one out")
+        raise PoiseError(
+            "--preset and --config both state all settings", hint="Leave one out", code="option-conflict"
+        )
     if config is not None:
         return from_toml(type(default), config, verb)
     if preset is None:
@@ -192,6 +194,8 @@ def dotted(argv: Sequence[str]) -> list[str]:
             continue
         name, equals, value = word[2:].partition("=")
         if not equals and (value := next(rest, "")) == "":
-            raise PoiseError(f"--{name} needs a value", hint=f"Write --{name} VALUE")
+            raise PoiseError(
+                f"--{name} needs a value", hint=f"Write --{name} VALUE", code="option-malformed"
+            )
         out += ["--set", f"{name}={value}"]
     return out

@@ -106,7 +106,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if not any(clip.is_dir() for clip in o.clips):
         return track_one(o)
     if o.save_policy is not None:
-        raise PoiseError("--save-policy is for one motion", hint="Leave it out")
+        raise PoiseError("--save-policy is for one motion", hint="Leave it out", code="single-clip-only")
     from poise.jobs.open import open_run
 
     with claimed(o.out):
@@ -122,12 +122,23 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 def check(o: Options) -> None:
     """Refuses what makes no sense, before anything is read or made."""
     if not o.clips:
-        raise PoiseError("poise track needs a motion file", hint="See poise track --help")
+        raise PoiseError(
+            "poise track needs a motion file", hint="See poise track --help", code="argument-missing"
+        )
     several = len(o.clips) > 1
     if several and (folder := next((c for c in o.clips if c.is_dir()), None)):
-        raise PoiseError("is a folder, and several clips are done in a row", folder, "Name its files")
+        raise PoiseError(
+            "is a folder, and several clips are done in a row",
+            folder,
+            "Name its files",
+            code="is-folder",
+        )
     if several and o.learn:
-        raise PoiseError("--learn is for a single clip", hint="Leave it out, or learn clip by clip")
+        raise PoiseError(
+            "--learn is for a single clip",
+            hint="Leave it out, or learn clip by clip",
+            code="single-clip-only",
+        )
     check_range("count", o.count, 1, 64)
     check_range("seed", o.seed, 0)
     check_range("learn", o.learn, 0, 100_000)
@@ -136,14 +147,20 @@ def check(o: Options) -> None:
     check_range("budget", o.budget, 1, 1_000_000)
     check_range("threads", o.threads, 0)
     if o.learn and o.body == "own":
-        raise PoiseError("the policy learns on its own body", hint="Leave --body own or --learn out")
+        raise PoiseError(
+            "the policy learns on its own body",
+            hint="Leave --body own or --learn out",
+            code="option-conflict",
+        )
     if o.learn and o.earlier:
         raise PoiseError(
-            "--learn learns the whole motion, and --range does a part", hint="Leave one out"
+            "--learn learns the whole motion, and --range does a part",
+            hint="Leave one out",
+            code="option-conflict",
         )
     if o.learn and o.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
-        raise PoiseError(what, hint="Leave one out")
+        raise PoiseError(what, hint="Leave one out", code="option-conflict")
 
 
 def track_one(options: Options, tracker: Tracker | None = None, folder: Path | None = None) -> Answer:
@@ -158,7 +175,9 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     if o.save_policy is not None:
         may_write(o.save_policy, o.force)
     if motion is not None and o.count > 1:
-        raise PoiseError("several characters make several files", motion, "Give a folder as -o")
+        raise PoiseError(
+            "several characters make several files", motion, "Give a folder as -o", code="folder-needed"
+        )
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, write
     from poise.jobs.track.direction import direction_of
@@ -236,7 +255,11 @@ def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support
 
     if options.support is not None:
         if not options.supports:
-            raise PoiseError("--support states what --no-supports forbids", hint="Leave one out")
+            raise PoiseError(
+                "--support states what --no-supports forbids",
+                hint="Leave one out",
+                code="option-conflict",
+            )
         return read_supports(options.support)
     return "auto" if options.supports else "none"
 

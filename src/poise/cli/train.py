@@ -59,7 +59,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     """Trains until the limit or Ctrl-C."""
     o = options
     if o.recipe not in RECIPES:
-        raise PoiseError(f"there is no recipe '{o.recipe}'. {did_you_mean(o.recipe, RECIPES)}")
+        raise PoiseError(
+            f"there is no recipe '{o.recipe}'. {did_you_mean(o.recipe, RECIPES)}", code="unknown-recipe"
+        )
     o.training.check(o.recipe_settings)
     config = config_of(o)
     if o.training.print_config:
@@ -83,7 +85,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             return inbetween(o.library, config, o.out, o.training, again)
         return perpetual(o, config, again)
     if not o.clips:
-        raise PoiseError("no clip was given", hint=f"Write poise train {o.recipe} CLIP -o RUNDIR")
+        raise PoiseError(
+            "no clip was given",
+            hint=f"Write poise train {o.recipe} CLIP -o RUNDIR",
+            code="argument-missing",
+        )
     job = Job(o.clips, o.out, o.out, o.training, config, o.reading, again)
     from poise.learn.parallel import joined
 
@@ -123,7 +129,11 @@ def config_of(o: Options) -> Any:
     for name in [*values, *(given(o.body) if "body" not in known else ())]:
         if name not in known and name not in own:
             option = {"num_envs": "envs", "going_on": "from"}.get(name, name.replace("_", "-"))
-            raise PoiseError(f"the recipe {o.recipe} has no --{option}", hint="Leave it out")
+            raise PoiseError(
+                f"the recipe {o.recipe} has no --{option}",
+                hint="Leave it out",
+                code="option-not-applicable",
+            )
     if o.recipe == "perpetual":
         return settings(o.primitives, o.training, o.body, values)
     if o.recipe == "endless":
@@ -131,7 +141,7 @@ def config_of(o: Options) -> Any:
     if o.recipe == "compliant" and o.clips:
         scene, *more = map(str, o.clips)
         if more:
-            raise PoiseError(f"one scene is learned at a time, got {len(more) + 1}")
+            raise PoiseError(f"one scene is learned at a time, got {len(more) + 1}", code="over-limit")
         values["scene"] = scene
     if "dropout" in values:
         values["between_training.dropout"] = values.pop("dropout")
@@ -144,8 +154,16 @@ def config_of(o: Options) -> Any:
 def _only_a_folder(o: Options) -> None:
     if o.clips:
         hint = f"Write poise train {o.recipe} --library DIR -o RUNDIR"
-        raise PoiseError(f"the recipe {o.recipe} learns from a folder, not from single clips", hint=hint)
+        raise PoiseError(
+            f"the recipe {o.recipe} learns from a folder, not from single clips",
+            hint=hint,
+            code="folder-needed",
+        )
     plain = Reading()
     for name, instead in _OF_A_CLIP:
         if getattr(o.reading, name) != getattr(plain, name):
-            raise PoiseError(f"--{name.replace('_', '-')} is about a single clip", hint=instead)
+            raise PoiseError(
+                f"--{name.replace('_', '-')} is about a single clip",
+                hint=instead,
+                code="single-clip-only",
+            )

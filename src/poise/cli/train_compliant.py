@@ -24,7 +24,11 @@ def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
     from poise.papers.compliant.training import RUN_FILE, train
 
     if training.device != "cpu":
-        raise PoiseError("the recipe compliant trains on the CPU", hint="Leave --device out")
+        raise PoiseError(
+            "the recipe compliant trains on the CPU",
+            hint="Leave --device out",
+            code="option-not-applicable",
+        )
     refuse_held(out, RUN_FILE, training)
     with working("opening the policy"):
         tracker = open_run(None).tracker

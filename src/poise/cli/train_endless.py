@@ -37,7 +37,9 @@ def run(
     for name in ("backwards", "onto"):
         if getattr(library, name):
             hint = "Leave it out; --from POLICY chooses the body" if name == "onto" else "Leave it out"
-            raise PoiseError(f"the recipe endless has no --{name}", hint=hint)
+            raise PoiseError(
+                f"the recipe endless has no --{name}", hint=hint, code="option-not-applicable"
+            )
     labels = read_labels(folder)
     refuse_held(out, RUN_FILE, training)
     torch.set_num_threads(training.threads or cores())

@@ -45,14 +45,20 @@ def run(library: Library, config: Inbetween, out: Path, training: Training, agai
 
     folder = library.folder("inbetween")
     if library.backwards:
-        raise PoiseError("the recipe inbetween has no --backwards", hint="Leave it out")
+        raise PoiseError(
+            "the recipe inbetween has no --backwards", hint="Leave it out", code="option-not-applicable"
+        )
     refuse_held(out, RUN_FILE, training)
     torch.set_num_threads(training.threads or cores())
     dropout = config.between_training.dropout
     if not 0 <= dropout < 1:
-        raise PoiseError(f"--dropout must be at least 0 and below 1, got {dropout:g}")
+        raise PoiseError(
+            f"--dropout must be at least 0 and below 1, got {dropout:g}", code="out-of-range"
+        )
     if dropout and config.net == "rtn":
-        raise PoiseError("the network rtn has no --dropout", hint="Leave it out")
+        raise PoiseError(
+            "the network rtn has no --dropout", hint="Leave it out", code="option-not-applicable"
+        )
     reading = config.reading
     if library.library_fps or library.library_skeleton:
         # Its windows are seen in a mirror, not the clips.

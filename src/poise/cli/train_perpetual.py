@@ -170,10 +170,14 @@ def settings(
 
     values = {name: value for name, value in options.items() if name not in BY_HAND}
     if not 1 <= values.get("max_primitives", 1) <= 64:
-        raise PoiseError(f"--max-primitives must lie in 1 to 64, got {values['max_primitives']}")
+        raise PoiseError(
+            f"--max-primitives must lie in 1 to 64, got {values['max_primitives']}", code="out-of-range"
+        )
     if primitives.paths and values.get("expert") is False:
         raise PoiseError(
-            "--paths are for the expert, and --no-expert does without", hint="Leave one out"
+            "--paths are for the expert, and --no-expert does without",
+            hint="Leave one out",
+            code="option-conflict",
         )
     if primitives.paths:
         # The LQR teacher on optimised trajectories needs no help at any time.
@@ -192,7 +196,9 @@ def settings(
 
         if primitives.going_on is not None:
             what = "--teacher POLICY is imitated by a new network, and --from goes on with one"
-            raise PoiseError(what, hint="Leave one out, or take --teacher lookahead")
+            raise PoiseError(
+                what, hint="Leave one out, or take --teacher lookahead", code="option-conflict"
+            )
         goal = {"goal": values["goal"]} if "goal" in values else {}
         default = taught_by(open_run(Path(primitives.teacher)).tracker.config, **goal)
     return training.settings("perpetual", default, body, values)
@@ -226,7 +232,7 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     library, primitives, body = o.library, o.primitives, o.body
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
-        raise PoiseError(what, hint="Leave --onto out")
+        raise PoiseError(what, hint="Leave --onto out", code="option-conflict")
     free = {"recovery", "recovery_clips", "single", "going_on", "teacher", "noise"}
     if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.add("max_primitives")
@@ -240,7 +246,7 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     names += [n for n in more if any(f"{n}.".startswith(k) or k.startswith(f"{n}.") for k in kept)]
     if names:
         what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
-        raise PoiseError(what, hint="Leave it out")
+        raise PoiseError(what, hint="Leave it out", code="option-conflict")
     return more
 
 
@@ -273,7 +279,9 @@ def run(o: TrainOptions, config: Perpetual, again: str) -> Answer:
     library.folder("perpetual")
     if launched() and int(os.environ["WORLD_SIZE"]) > 1:
         hint = "Start it without torchrun; --threads and --device take all of one machine"
-        raise PoiseError("the recipe perpetual trains in one process", hint=hint)
+        raise PoiseError(
+            "the recipe perpetual trains in one process", hint=hint, code="option-not-applicable"
+        )
     from poise.jobs.perpetual.run import train
     from poise.jobs.run_file import RUN_FILE
     from poise.learn import LATEST, Until
@@ -316,7 +324,7 @@ def _teacher(primitives: Primitives, library: Library) -> Tracker:
 
     if library.onto is not None:
         what = "--teacher POLICY brings the clips onto its body, and --onto onto another skeleton"
-        raise PoiseError(what, hint="Leave --onto out")
+        raise PoiseError(what, hint="Leave --onto out", code="option-conflict")
     assert primitives.teacher is not None
     return open_run(Path(primitives.teacher)).tracker
 

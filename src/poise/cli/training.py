@@ -217,7 +217,9 @@ class Job:
 
 def held_already(out: Path) -> PoiseError:
     """What is said of a run that is there and was not asked to go on."""
-    return PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
+    return PoiseError(
+        "already holds a run", out, "Go on with --resume, or choose another folder", code="run-exists"
+    )
 
 
 def refuse_held(out: Path, run_file: str, training: Training) -> None:

@@ -91,12 +91,20 @@ class Compliance:
         for level in (self.level, *(self.drawn or ())):
             check_level(level)
         if self.law not in ("eq8", "algorithm1"):
-            raise PoiseError(f"the law is eq8 or algorithm1, got '{self.law}'", "Compliance")
+            raise PoiseError(
+                f"the law is eq8 or algorithm1, got '{self.law}'", "Compliance", code="unknown-choice"
+            )
         if self.weighting not in ("inverse", "printed"):
-            raise PoiseError(f"weighting is inverse or printed, got '{self.weighting}'", "Compliance")
+            raise PoiseError(
+                f"weighting is inverse or printed, got '{self.weighting}'",
+                "Compliance",
+                code="unknown-choice",
+            )
         shares = [*self.axes, *(v for _, v in self.joints)]
         if len(self.axes) != 3 or not all(0.0 <= s <= 1.0 for s in shares):
-            raise PoiseError("shares of axes and joints must lie in 0 to 1", "Compliance")
+            raise PoiseError(
+                "shares of axes and joints must lie in 0 to 1", "Compliance", code="out-of-range"
+            )
         _check_rest(self.weights, self.return_hz, self.least_n, "Compliance")
 
     @property
@@ -139,7 +147,9 @@ class Stiffness:
     def __post_init__(self) -> None:
         check_stiffness(self.newtons_per_metre)
         if not self.lag_s > 0.0:
-            raise PoiseError(f"lag_s must be above 0, got {self.lag_s:g}", "Stiffness")
+            raise PoiseError(
+                f"lag_s must be above 0, got {self.lag_s:g}", "Stiffness", code="out-of-range"
+            )
         _check_rest(self.weights, self.return_hz, self.least_n, "Stiffness")
 
     notes = ()
@@ -156,6 +166,7 @@ def check_level(level: float) -> None:
         raise PoiseError(
             f"the level of compliance must lie in 0 to 1, got {level:g}{why}",
             hint="0.16 gives way as in the paper, above 0.2 joints become implausible",
+            code="out-of-range",
         )
 
 
@@ -166,14 +177,16 @@ def check_stiffness(newtons_per_metre: float) -> None:
         PoiseError: it is not above 0.
     """
     if not 0.0 < newtons_per_metre < math.inf:
-        raise PoiseError(f"a stiffness must be above 0 N/m, got {newtons_per_metre:g}")
+        raise PoiseError(
+            f"a stiffness must be above 0 N/m, got {newtons_per_metre:g}", code="out-of-range"
+        )
 
 
 def _check_rest(weights: Parts, return_hz: float, least_n: float, where: str) -> None:
     if not all(0.0 < w < math.inf for _, w in weights):
-        raise PoiseError("weights of columns must be above 0", where)
+        raise PoiseError("weights of columns must be above 0", where, code="out-of-range")
     if not return_hz > 0.0 or not least_n >= 0.0:
-        raise PoiseError("return_hz must be above 0 and least_n at least 0", where)
+        raise PoiseError("return_hz must be above 0 and least_n at least 0", where, code="out-of-range")
 
 
 def columns(table: BodyTable, parts: Parts, root: bool) -> Tensor:
@@ -190,7 +203,9 @@ def columns(table: BodyTable, parts: Parts, root: bool) -> Tensor:
     for name in known:
         if name not in kinds:
             raise PoiseError(
-                f"no part of the body is called '{name}'", hint=did_you_mean(name, sorted(names))
+                f"no part of the body is called '{name}'",
+                hint=did_you_mean(name, sorted(names)),
+                code="unknown-body-part",
             )
     hinges = [known.get(r.name, known.get(r.kind, 1.0)) for r in table.rows for _ in r.hinge_names()]
     along = [1.0, 1.0] if root else [0.0, 0.0]

@@ -28,7 +28,9 @@ class PDTargets:
 
     def __post_init__(self) -> None:
         if self.mode not in ("additive", "absolute"):
-            raise PoiseError(f"the action must be additive or absolute, got '{self.mode}'")
+            raise PoiseError(
+                f"the action must be additive or absolute, got '{self.mode}'", code="unknown-choice"
+            )
 
     def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""

@@ -83,7 +83,9 @@ def _of_worlds(scale: Tensor | float) -> Tensor | float:
 def _check_limits(limit_n: float, limit_nm: float) -> None:
     for name, value in (("force", limit_n), ("torque", limit_nm)):
         if not 0.0 <= value < float("inf"):
-            raise PoiseError(f"the residual {name} limit must be at least 0, got {value}")
+            raise PoiseError(
+                f"the residual {name} limit must be at least 0, got {value}", code="out-of-range"
+            )
 
 
 def _capped(vectors: Tensor) -> Tensor:
@@ -173,7 +175,10 @@ class ExplicitResidual:
     def __post_init__(self) -> None:
         _check_limits(self.limit_n, self.limit_nm)
         if not self.bodies or len(set(self.bodies)) != len(self.bodies):
-            raise PoiseError(f"explicit residual forces need different bodies, got rows {self.bodies}")
+            raise PoiseError(
+                f"explicit residual forces need different bodies, got rows {self.bodies}",
+                code="name-repeated",
+            )
 
     @property
     def dims(self) -> int:
@@ -254,7 +259,8 @@ class LinearHelp:
     def __post_init__(self) -> None:
         if not 0 <= self.start < self.stop:
             raise PoiseError(
-                f"help must fall from one step to a later one, got {self.start}, {self.stop}"
+                f"help must fall from one step to a later one, got {self.start}, {self.stop}",
+                code="not-rising",
             )
         _check_final(self.final)
 
@@ -291,10 +297,11 @@ class SuccessHelp:
     def __post_init__(self) -> None:
         if not 0 < self.raise_at < self.lower_at <= 1:
             raise PoiseError(f"success must satisfy 0 < raise_at {self.raise_at} < lower_at "
-                             f"{self.lower_at} <= 1")  # fmt: skip
+                             f"{self.lower_at} <= 1", code="not-rising")  # fmt: skip
         if not (0 < self.factor < 1 and 0 < self.smallest <= 1):
             raise PoiseError(
-                f"factor and smallest must lie in (0, 1), got {self.factor}, {self.smallest}"
+                f"factor and smallest must lie in (0, 1), got {self.factor}, {self.smallest}",
+                code="out-of-range",
             )
         _check_final(self.final)
 
@@ -310,4 +317,6 @@ class SuccessHelp:
 
 def _check_final(final: float) -> None:
     if not 0 <= final <= 1:
-        raise PoiseError(f"the last scale of the help must lie in [0, 1], got {final}")
+        raise PoiseError(
+            f"the last scale of the help must lie in [0, 1], got {final}", code="out-of-range"
+        )

@@ -154,7 +154,10 @@ class Controls:
     ):
         hinges = len(humanoid.hinges)
         if backend.model.nu != hinges:
-            raise PoiseError(f"the model has {backend.model.nu} actuators, the body {hinges} hinges")
+            raise PoiseError(
+                f"the model has {backend.model.nu} actuators, the body {hinges} hinges",
+                code="count-differs",
+            )
         self._task, self._backend, self.hinges = task, backend, hinges
         self.num_actions = hinges + (task.residual.dims if task.residual else 0)
         n, here = backend.num_envs, backend.device
@@ -179,7 +182,9 @@ class Controls:
         """
         want = self.action.shape
         if actions.shape != want:
-            raise PoiseError(f"actions must be {tuple(want)}, got {tuple(actions.shape)}")
+            raise PoiseError(
+                f"actions must be {tuple(want)}, got {tuple(actions.shape)}", code="wrong-shape"
+            )
         self.before.copy_(self.action)
         if torques:
             forces = (self._backend.state[k] for k in ("qfrc_actuator", "qfrc_damper"))

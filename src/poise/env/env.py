@@ -73,11 +73,16 @@ def put(env: ImitationEnv, snapshot: Snapshot, rows: Tensor | None) -> None:
     if len(snapshot) == 1 and count > 1:
         snapshot = snapshot.repeated(count)
     if len(snapshot) != count:
-        raise PoiseError(f"the snapshot holds {len(snapshot)} worlds, and {count} are to be restored")
+        raise PoiseError(
+            f"the snapshot holds {len(snapshot)} worlds, and {count} are to be restored",
+            code="count-differs",
+        )
     into = _rows(env)
     missing = sorted(into.keys() - snapshot.worlds.keys())
     if missing:
-        raise PoiseError(f"the snapshot of another kind of environment has no '{missing[0]}'")
+        raise PoiseError(
+            f"the snapshot of another kind of environment has no '{missing[0]}'", code="snapshot-differs"
+        )
     env.goal.load_shared(snapshot.goal)
     for name, value in into.items():
         if rows is None:
@@ -306,7 +311,9 @@ class ImitationEnv:
             ordinary ones.
         """
         if kind is not None and not any(type(p).kinds is not Plugin.kinds for p in self.plugins):
-            raise PoiseError("this task knows no falls", hint="Set TaskConfig.recovery")
+            raise PoiseError(
+                "this task knows no falls", hint="Set TaskConfig.recovery", code="recovery-off"
+            )
         self.goal.seek(clip, frame)
         self._place(None, kind)
         return self.observe()

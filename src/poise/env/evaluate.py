@@ -267,7 +267,8 @@ class Terms:
                 if not good or (kind == "termination") != (value.dtype == torch.bool):
                     got = f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
                     raise PoiseError(
-                        f"the {kind} '{term.name}' must be {want} for N = {worlds}, got {got}"
+                        f"the {kind} '{term.name}' must be {want} for N = {worlds}, got {got}",
+                        code="wrong-shape",
                     )
         self.evaluated(sources)
 

@@ -99,18 +99,30 @@ def ends_on(sim: SceneSim, rows: CharacterRows, name: str) -> list[End]:
     link = next((x for x in scene.links if x.name == name), None)
     if touch is None and link is None:
         known = [x.name for x in (*scene.touches, *scene.links)]
-        raise PoiseError(f"there is no touch or link '{name}'", "InScene", did_you_mean(name, known))
+        raise PoiseError(
+            f"there is no touch or link '{name}'",
+            "InScene",
+            did_you_mean(name, known),
+            code="unknown-link",
+        )
     found: list[End] = []
     for body, sign in _ends(sim, name, touch):
         for k, place in enumerate(rows.places):
             if touch is not None and body == place.name:
                 hint = "Touch its bodies one by one, see poise.env.events.touches_of"
-                raise PoiseError(f"touch '{name}' does not say which body is touched", "InScene", hint)
+                raise PoiseError(
+                    f"touch '{name}' does not say which body is touched",
+                    "InScene",
+                    hint,
+                    code="touch-ambiguous",
+                )
             if body in _bodies(sim, place.bodies):
                 row = sim.scene.model.body(body).id - place.bodies.start + 1
                 found.append(End(name, touch is None, k, row, sign))
     if not found:
-        raise PoiseError(f"'{name}' acts on none of these characters' bodies", "InScene")
+        raise PoiseError(
+            f"'{name}' acts on none of these characters' bodies", "InScene", code="no-bodies"
+        )
     return found
 
 
@@ -176,7 +188,9 @@ class InScene:
         """The plug-in of an environment."""
         if not isinstance(backend, CharacterRows) or backend.sim is None:
             hint = "Give the environment SceneSim(...).characters() as backend"
-            raise PoiseError("a task in a scene needs the characters of a scene", "InScene", hint)
+            raise PoiseError(
+                "a task in a scene needs the characters of a scene", "InScene", hint, code="scene-needed"
+            )
         kind = MeteredPart if self.metered else ScenePart
         return kind(self, backend, backend.sim, goal.rate_hz)
 
@@ -193,7 +207,7 @@ class ScenePart(Plugin):
         self.given, self._rows, self.sim = given, rows, sim
         self._many = len(rows.places)
         if OTHERS in given.sees and self._many < 2:
-            raise PoiseError("there are no others among these rows", "InScene")
+            raise PoiseError("there are no others among these rows", "InScene", code="no-bodies")
         self.happenings = [make(sim, control_hz) for make in given.events]
         self._sources: dict[str, Tensor] = {}
         for name in (*given.touches, *given.metered):

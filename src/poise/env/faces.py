@@ -44,6 +44,7 @@ class GymVectorEnv(VectorEnv):
             raise PoiseError(
                 "the vector environment needs worlds that reset themselves, but auto_reset is off",
                 hint="Make the ImitationEnv with auto_reset=True",
+                code="auto-reset-needed",
             )
         self.env, self.num_envs = env, env.num_envs
         self.log: dict[str, float] = {}
@@ -95,6 +96,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 f"a single environment needs one world without auto_reset, got {env.num_envs} with "
                 f"auto_reset={env.task.auto_reset}",
                 hint="Make the ImitationEnv with num_envs=1, auto_reset=False, or use GymVectorEnv",
+                code="single-world-needed",
             )
         self.env = env
         self.observation_space, self.action_space = _spaces(env, limit)
@@ -124,7 +126,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 def _spaces(env: ImitationEnv, limit: float) -> tuple[Box, Box]:
     if not limit > 0:
-        raise PoiseError(f"the action limit must be above 0, got {limit}")
+        raise PoiseError(f"the action limit must be above 0, got {limit}", code="out-of-range")
     obs = Box(-np.inf, np.inf, (env.num_obs,), np.float32)
     return obs, Box(-limit, limit, (env.num_actions,), np.float32)
 
@@ -168,6 +170,7 @@ class RslRlVecEnv:
             raise PoiseError(
                 "rsl_rl needs worlds that reset themselves, but auto_reset is off",
                 hint="Make the ImitationEnv with auto_reset=True",
+                code="auto-reset-needed",
             )
         try:
             self._dict = import_module("tensordict").TensorDict
@@ -175,6 +178,7 @@ class RslRlVecEnv:
             raise PoiseError(
                 "RslRlVecEnv needs tensordict, which is not installed",
                 hint="Install it with: pip install 'poise-motion[rsl-rl]'",
+                code="extra-missing",
             ) from None
         self.env, self.device = env, torch.device(device)
         self.num_envs, self.num_obs, self.num_actions = env.num_envs, env.num_obs, env.num_actions

@@ -251,6 +251,7 @@ class RewardTerm:
             raise PoiseError(
                 f"the term '{self.name}' is a cost and counts as imitation",
                 hint="Give it imitation=False",
+                code="settings-conflict",
             )
 
 

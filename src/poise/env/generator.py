@@ -62,7 +62,8 @@ class GeneratorGoal(BufferedGoal):
         if generator.past < 1 or generator.future < 1:
             raise PoiseError(
                 f"a generator sees and makes at least 1 frame, got past {generator.past} and future "
-                f"{generator.future}"
+                f"{generator.future}",
+                code="out-of-range",
             )
         size = generator.past + 2 * generator.future + lead + 2
         super().__init__(humanoid, rate_hz, num_envs, size, torch.device(device), seed)
@@ -87,6 +88,7 @@ class GeneratorGoal(BufferedGoal):
                 f"the generator begins with {tuple(frames.shape)} coordinates, which must be finite and "
                 f"{want}",
                 type(self.generator).__name__,
+                code="wrong-shape",
             )
         self.clear(ids)
         self.extend(ids, frames.to(self.qpos))
@@ -107,6 +109,7 @@ class GeneratorGoal(BufferedGoal):
                 f"the generator made {tuple(made.shape)} coordinates, and {len(short)} motions of "
                 f"{g.future} frames have ({len(short)}, {g.future}, {past.shape[-1]})",
                 type(g).__name__,
+                code="wrong-shape",
             )
         good = made.isfinite().all(-1).all(-1)
         for i in short[~good].tolist():
@@ -150,7 +153,7 @@ class Steering:
     def __post_init__(self) -> None:
         for x, y in self.targets:
             if not (abs(x) <= FAR and abs(y) <= FAR):
-                raise PoiseError(f"a target lies within {FAR:g} m, got {x:g},{y:g}")
+                raise PoiseError(f"a target lies within {FAR:g} m, got {x:g},{y:g}", code="out-of-range")
 
     @property
     def chooses(self) -> bool:

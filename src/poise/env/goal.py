@@ -131,7 +131,11 @@ class Goal(ABC):
 
     def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
         """What a step that led to `row (N,)` says of motion bins, see `MotionBins.outcomes`."""
-        raise PoiseError("this goal has no motion bins", hint="Take help_by='all' and adaptive=0")
+        raise PoiseError(
+            "this goal has no motion bins",
+            hint="Take help_by='all' and adaptive=0",
+            code="goal-without-clips",
+        )
 
     @property
     def clips(self) -> ClipGoal:
@@ -140,7 +144,7 @@ class Goal(ABC):
         Raises:
             PoiseError: it is made of none.
         """
-        raise PoiseError(f"a {type(self).__name__} follows no clips")
+        raise PoiseError(f"a {type(self).__name__} follows no clips", code="goal-without-clips")
 
     def where(self, env: int) -> str:
         """Which part of the goal world `env` is at, for messages."""
@@ -313,7 +317,9 @@ class ClipGoal(Goal):
         if not known.all():
             at = int((~known).nonzero()[0, 0])
             what = f"frame {int(frame[at])} of clip {int(clip[at])}"
-            raise PoiseError(f"environment {at} stands at {what}, which is not there")
+            raise PoiseError(
+                f"environment {at} stands at {what}, which is not there", code="frame-outside"
+            )
 
     def rows(self) -> dict[str, Tensor]:
         return {"clip": self.clip, "frame": self.frame}

@@ -45,7 +45,9 @@ class HelpBudget(Plugin):
         by: Group = "all",
     ):
         if groups < 1:
-            raise PoiseError(f"help needs at least 1 group, got {groups}", "HelpBudget")
+            raise PoiseError(
+                f"help needs at least 1 group, got {groups}", "HelpBudget", code="out-of-range"
+            )
         self.schedule, self.groups, self.steps, self.now = schedule, groups, 0, 1.0
         self.by: Group = by
         self.scale = torch.ones(() if groups == 1 else (groups,), device=device)
@@ -63,7 +65,10 @@ class HelpBudget(Plugin):
         """
         given = scale.detach().cpu().numpy() if isinstance(scale, Tensor) else np.asarray(scale)
         if given.ndim and given.shape != (self.groups,):
-            raise PoiseError(f"{self.groups} groups need as many scales of help, got {given.shape}")
+            raise PoiseError(
+                f"{self.groups} groups need as many scales of help, got {given.shape}",
+                code="count-differs",
+            )
         self._scales = np.broadcast_to(given, (self.groups,)).astype(np.float32)
         self._look()
         if self.groups == 1:
@@ -168,7 +173,7 @@ class HelpBudget(Plugin):
             self._counts.zero_()
         elif len(own) != 3 * self.groups:
             what = f"the state is that of help for {len(own) // 3} groups, and there are {self.groups}"
-            raise PoiseError(what)
+            raise PoiseError(what, code="state-differs")
         else:
             own = own.reshape(3, self.groups)
             self.set(own[0])

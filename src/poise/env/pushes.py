@@ -38,15 +38,19 @@ class Push:
 
     def __post_init__(self) -> None:
         if self.row < 0 or self.first < 0 or self.steps < 1:
-            raise PoiseError("row and first must be at least 0, steps at least 1", "Push")
+            raise PoiseError(
+                "row and first must be at least 0, steps at least 1", "Push", code="out-of-range"
+            )
         if not all(math.isfinite(f) for f in self.force):
-            raise PoiseError(f"the force is not finite: {self.force}", "Push")
+            raise PoiseError(f"the force is not finite: {self.force}", "Push", code="not-finite")
 
     def __call__(self, goal: Goal, backend: Backend) -> OnePush:
         """The plug-in of an environment."""
         bodies = len(goal.humanoid.bodies)
         if self.row >= bodies:
-            raise PoiseError(f"the body has {bodies} parts, there is no row {self.row}", "Push")
+            raise PoiseError(
+                f"the body has {bodies} parts, there is no row {self.row}", "Push", code="index-outside"
+            )
         return OnePush(self, backend)
 
 
@@ -142,14 +146,22 @@ class Pushes:
         for name in ("newtons", "every_s"):
             low, high = getattr(self, name)
             if not 0.0 <= low <= high < float("inf"):
-                raise PoiseError(f"{name} must rise from at least 0, got {low:g} to {high:g}", "Pushes")
+                raise PoiseError(
+                    f"{name} must rise from at least 0, got {low:g} to {high:g}",
+                    "Pushes",
+                    code="not-rising",
+                )
         low, high = self.lasting
         if not (0.0 < low <= high and self.control_hz > 0.0 and self.impulse_ns > 0.0):
-            raise PoiseError("lasts_s, control_hz and impulse_ns must be above 0", "Pushes")
+            raise PoiseError(
+                "lasts_s, control_hz and impulse_ns must be above 0", "Pushes", code="out-of-range"
+            )
         if not 0.0 <= self.share <= 1.0:
-            raise PoiseError(f"share must lie in 0 to 1, got {self.share:g}", "Pushes")
+            raise PoiseError(
+                f"share must lie in 0 to 1, got {self.share:g}", "Pushes", code="out-of-range"
+            )
         if not self.bodies:
-            raise PoiseError("pushes need at least one body", "Pushes")
+            raise PoiseError("pushes need at least one body", "Pushes", code="no-bodies")
 
     @property
     def lasting(self) -> tuple[float, float]:

@@ -166,18 +166,23 @@ class Reference:
         cyclic = [False] * len(motions) if cyclic is None else list(cyclic)
         if not motions or len(names) != len(motions) or len(cyclic) != len(motions):
             raise PoiseError(
-                f"a reference needs as many names as motions, got {len(names)} and {len(motions)}"
+                f"a reference needs as many names as motions, got {len(names)} and {len(motions)}",
+                code="count-differs",
             )
         for name, q in zip(names, motions, strict=True):
             if len(q) < 3:
                 raise PoiseError(
-                    f"the clip has {len(q)} frames at {rate_hz:g} Hz and needs at least 3", name
+                    f"the clip has {len(q)} frames at {rate_hz:g} Hz and needs at least 3",
+                    name,
+                    code="clip-too-short",
                 )
         self.humanoid, self.rate_hz, self.names = humanoid, rate_hz, tuple(names)
         self.bodies = (humanoid,) if bodies is None else tuple(bodies)
         self.body = torch.tensor([0] * len(motions) if body is None else list(body))
         if self.bodies[0] is not humanoid or len(self.body) != len(motions):
-            raise PoiseError("a reference needs a body for each clip, and its own as the first")
+            raise PoiseError(
+                "a reference needs a body for each clip, and its own as the first", code="count-differs"
+            )
         self.poser = Poser(humanoid)
         self.kinematics = self.poser.kinematics
         qpos = torch.tensor(np.concatenate(motions), dtype=torch.float64)
@@ -304,7 +309,10 @@ class Reference:
             PoiseError: not so many clips or frames.
         """
         if [len(q) for q in motions] != self.length.tolist():
-            raise PoiseError("what policies are told needs a frame for each of the clips' frames")
+            raise PoiseError(
+                "what policies are told needs a frame for each of the clips' frames",
+                code="count-differs",
+            )
         speed = [cycle_velocity if c else qpos_velocity for c in self.cyclic.tolist()]
         moves = [of(q, self.rate_hz) for of, q in zip(speed, motions, strict=True)]
         qpos, qvel = (torch.tensor(np.concatenate(x), dtype=torch.float64) for x in (motions, moves))
@@ -426,6 +434,7 @@ def differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
             raise PoiseError(
                 f"the bodies differ in more than numbers: MuJoCo's '{name}' is not the same",
                 hint="Give bodies with the same joints, hinges and kinds of shapes",
+                code="bodies-differ",
             )
         out[name] = np.stack(arrays)
     return out

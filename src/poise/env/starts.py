@@ -43,7 +43,9 @@ class Starts:
         self.bins = None if bins is None else bins.to(torch.device("cpu"))
         for what, share in (("on frame 0", first), ("by adaptive sampling", hard)):
             if not 0.0 <= share <= 1.0:
-                raise PoiseError(f"the share of starts {what} must lie in [0, 1], got {share}")
+                raise PoiseError(
+                    f"the share of starts {what} must lie in [0, 1], got {share}", code="out-of-range"
+                )
         self._weights = self._checked((self.length - 1).double() if weights is None else weights)
         self.rng = torch.Generator().manual_seed(seed)
 
@@ -60,9 +62,14 @@ class Starts:
     def _checked(self, odds: Tensor) -> Tensor:
         odds = odds.detach().double().cpu().clone()
         if odds.shape != self.length.shape:
-            raise PoiseError(f"{len(self.length)} clips need as many odds, got {tuple(odds.shape)}")
+            raise PoiseError(
+                f"{len(self.length)} clips need as many odds, got {tuple(odds.shape)}",
+                code="bad-weights",
+            )
         if not bool(odds.isfinite().all()) or bool((odds < 0).any()) or not float(odds.sum()) > 0:
-            raise PoiseError("the odds of clips must be finite, not below 0 and not all 0")
+            raise PoiseError(
+                "the odds of clips must be finite, not below 0 and not all 0", code="bad-weights"
+            )
         return odds
 
     def draw(self, count: int, odds: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -273,6 +273,7 @@ class StreamGoal(BufferedGoal):
                 f"a frame has {width} coordinates for this body, or ({len(ids)}, {width}) for "
                 f"{len(ids)} worlds, got {tuple(qpos.shape)}",
                 "the stream",
+                code="wrong-shape",
             )
         qpos = qpos.expand(len(ids), width)
         norm = cast("Tensor", qpos[:, 3:7].norm(dim=-1))
@@ -334,7 +335,12 @@ class StreamGoal(BufferedGoal):
         """
         self.at[ids] = self.count[ids] - 1
         if bool((self.at[ids] < 0).any()):
-            raise PoiseError("nothing has arrived yet", "the stream", "Push a frame before the reset")
+            raise PoiseError(
+                "nothing has arrived yet",
+                "the stream",
+                "Push a frame before the reset",
+                code="nothing-arrived",
+            )
 
     def supply(self, ids: Tensor) -> None:
         late = self.at[ids] + 1 - self.count[ids]

@@ -96,6 +96,7 @@ class ClipWindows:
             raise PoiseError(
                 "a motion prior needs to know what it sees of a frame",
                 hint="Set TaskConfig.style, for instance to phc_obs.style_terms(humanoid)",
+                code="settings-conflict",
             )
         self.features, self.frames, self.weights = features, frames, weights
         self.reference = reference = features.reference
@@ -106,6 +107,7 @@ class ClipWindows:
             raise PoiseError(
                 f"no clip has the {frames} frames of a window, the longest has {int(length.max())}",
                 hint="Give longer clips, or fewer AmpConfig.frames",
+                code="clip-too-short",
             )
 
     def __call__(self, count: int, generator: torch.Generator) -> Tensor:

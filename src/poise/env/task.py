@@ -116,21 +116,27 @@ class TaskConfig:
     def __post_init__(self) -> None:
         if self.help_by not in ("all", "clip", "bin"):
             what = f"help is given by 'all', 'clip' or 'bin', got '{self.help_by}'"
-            raise PoiseError(what, "TaskConfig")
+            raise PoiseError(what, "TaskConfig", code="unknown-choice")
         if not 0 <= self.filter < 1:
-            raise PoiseError(f"filter must lie in 0 to below 1, got {self.filter}", "TaskConfig")
+            raise PoiseError(
+                f"filter must lie in 0 to below 1, got {self.filter}", "TaskConfig", code="out-of-range"
+            )
         for terms in (self.obs, self.rewards, self.dones):
             names = [t.name for t in terms]
             twice = [n for n in names if names.count(n) > 1]
             if twice:
                 raise PoiseError(
-                    f"two terms are called '{twice[0]}'", "TaskConfig", "Rename one of them"
+                    f"two terms are called '{twice[0]}'",
+                    "TaskConfig",
+                    "Rename one of them",
+                    code="name-repeated",
                 )
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:
             raise PoiseError(
                 f"the reward '{lost[0]}' counts far from the reference alone, and no world is ever far",
                 hint="Set TaskConfig.recovery, for instance to Recovery.phc()",
+                code="recovery-off",
             )
 
 

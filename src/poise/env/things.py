@@ -51,6 +51,7 @@ class _SetDown(Drawn):
                 f"'{event.name}' has {place.coordinates} coordinates and {dofs} velocities, got "
                 f"{len(event.qpos)} and {len(event.qvel)}",
                 "SetDown",
+                code="count-differs",
             )
         self._event, self._sim = event, sim
         self._qpos = torch.tensor(event.qpos, dtype=torch.float64)
@@ -95,9 +96,13 @@ class Throw:
         for name in ("speed", "every_s"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
-                raise PoiseError(f"{name} must rise from above 0, got {low:g} to {high:g}", "Throw")
+                raise PoiseError(
+                    f"{name} must rise from above 0, got {low:g} to {high:g}", "Throw", code="not-rising"
+                )
         if not self.distance > 0.0:
-            raise PoiseError(f"distance must be above 0, got {self.distance:g}", "Throw")
+            raise PoiseError(
+                f"distance must be above 0, got {self.distance:g}", "Throw", code="out-of-range"
+            )
 
     def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
         """The event in the worlds of a scene."""
@@ -108,11 +113,18 @@ class _Throw(Drawn):
     def __init__(self, event: Throw, sim: SceneSim, control_hz: float):
         super().__init__(event.seed)
         if sim.scene.place(event.name).coordinates != 7:
-            raise PoiseError(f"'{event.name}' is not free to fly", "Throw", "Throw a Ball or a Box")
+            raise PoiseError(
+                f"'{event.name}' is not free to fly",
+                "Throw",
+                "Throw a Ball or a Box",
+                code="not-free-to-fly",
+            )
         names = [sim.scene.model.body(i).name for i in range(sim.scene.model.nbody)]
         if event.at not in names:
             hint = did_you_mean(event.at, names)
-            raise PoiseError(f"there is no body '{event.at}' in the scene", "Throw", hint)
+            raise PoiseError(
+                f"there is no body '{event.at}' in the scene", "Throw", hint, code="unknown-body"
+            )
         self._event, self._sim, self._hz = event, sim, control_hz
         self._body = names.index(event.at)
         self.left = torch.zeros(sim.num_envs, dtype=torch.long, device=sim.backend.device)
@@ -180,7 +192,7 @@ class _Switch(Happening):
         names = [link.name for link in sim.scene.scene.links]
         if event.link not in names:
             hint = did_you_mean(event.link, names)
-            raise PoiseError(f"there is no link '{event.link}'", "Switch", hint)
+            raise PoiseError(f"there is no link '{event.link}'", "Switch", hint, code="unknown-link")
         self._event, self._sim, self._row = event, sim, names.index(event.link)
 
     def begin(self, worlds: Tensor) -> None:

@@ -201,6 +201,7 @@ class Yielding(Plugin):
                     "characters do not",
                     "Compliance",
                     "Take law='eq8'",
+                    code="settings-conflict",
                 )
         model = backend.model
         ranges = np.where(model.jnt_limited[1:, None] == 1, model.jnt_range[1:], [-np.inf, np.inf])

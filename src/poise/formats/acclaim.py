@@ -103,7 +103,7 @@ def parse_asf(path: Path) -> AsfFile:
         current.append((line, words))
     for name in ("root", "bonedata", "hierarchy"):
         if not sections.get(name):
-            raise PoiseError(f"the skeleton has no :{name} section", path, CUT_OFF)
+            raise PoiseError(f"the skeleton has no :{name} section", path, CUT_OFF, code="part-missing")
     for line, words in sections.get("units", []):
         _unit(asf, words, at_line(path, line))
     for line, words in sections["root"]:
@@ -111,7 +111,7 @@ def parse_asf(path: Path) -> AsfFile:
     _bonedata(asf, sections["bonedata"])
     _hierarchy(asf, sections["hierarchy"])
     if not any(np.any(b.direction) and b.length > 0 for b in asf.bones.values()):
-        raise PoiseError("no bone of the skeleton has any length", path)
+        raise PoiseError("no bone of the skeleton has any length", path, code="skeleton-without-length")
     return asf
 
 
@@ -120,10 +120,14 @@ def _unit(asf: AsfFile, words: list[str], where: str) -> None:
     if key == "length":
         asf.length = number(value, where)
         if not asf.length > 0:
-            raise PoiseError(f"the unit of length must be above 0, got {value}", where)
+            raise PoiseError(
+                f"the unit of length must be above 0, got {value}", where, code="out-of-range"
+            )
     elif key == "angle":
         if value.lower()[:3] not in ("deg", "rad"):
-            raise PoiseError(f"the unit of angles must be deg or rad, got {shown(value)}", where)
+            raise PoiseError(
+                f"the unit of angles must be deg or rad, got {shown(value)}", where, code="unit-unknown"
+            )
         asf.angle = float(np.pi / 180) if value.lower().startswith("deg") else 1.0
 
 
@@ -137,6 +141,7 @@ def _root_entry(asf: AsfFile, root: Bone, line: int, words: list[str]) -> None:
                 f"the root's order must name tx ty tz rx ry rz at most once each, got "
                 f"{shown(' '.join(words[1:]))}",
                 where,
+                code="bad-axis-order",
             )
         root.dof = tuple(w for w in asf.order if w in ROTATIONS)
     elif key == "axis":
@@ -150,13 +155,15 @@ def _root_entry(asf: AsfFile, root: Bone, line: int, words: list[str]) -> None:
 
 def _vector(words: list[str], where: str) -> tuple[float, float, float]:
     if len(words) < 3:
-        raise PoiseError(f"three numbers were expected, got {len(words)}", where)
+        raise PoiseError(f"three numbers were expected, got {len(words)}", where, code="row-width")
     return number(words[0], where), number(words[1], where), number(words[2], where)
 
 
 def _order(word: str, where: str) -> str:
     if sorted(word.upper()) != ["X", "Y", "Z"]:
-        raise PoiseError(f"the order of an axis must be like XYZ, got {shown(word)}", where)
+        raise PoiseError(
+            f"the order of an axis must be like XYZ, got {shown(word)}", where, code="bad-axis-order"
+        )
     return word.upper()
 
 
@@ -167,10 +174,16 @@ def _bonedata(asf: AsfFile, lines: list[_Line]) -> None:
         where, key = at_line(asf.path, line), words[0].lower()
         if key == "begin":
             if bone is not None:
-                raise PoiseError(f"bone {shown(bone.name)} has no 'end' before the next 'begin'", where)
+                raise PoiseError(
+                    f"bone {shown(bone.name)} has no 'end' before the next 'begin'",
+                    where,
+                    code="section-unclosed",
+                )
             bone, limits = Bone("", line), False
         elif bone is None:
-            raise PoiseError(f"{shown(words[0])} stands outside any begin and end", where)
+            raise PoiseError(
+                f"{shown(words[0])} stands outside any begin and end", where, code="line-misplaced"
+            )
         elif key == "end":
             _close(asf, bone)
             bone = None
@@ -180,7 +193,12 @@ def _bonedata(asf: AsfFile, lines: list[_Line]) -> None:
         else:
             _bone_entry(asf, bone, key, words[1:], where)
     if bone is not None:
-        raise PoiseError(f"bone {shown(bone.name)} has no 'end'", at_line(asf.path, bone.line), CUT_OFF)
+        raise PoiseError(
+            f"bone {shown(bone.name)} has no 'end'",
+            at_line(asf.path, bone.line),
+            CUT_OFF,
+            code="section-unclosed",
+        )
 
 
 def _bone_entry(asf: AsfFile, bone: Bone, key: str, values: list[str], where: str) -> None:
@@ -202,9 +220,12 @@ def _bone_entry(asf: AsfFile, bone: Bone, key: str, values: list[str], where: st
                 f"bone '{bone.name}' has the degree of freedom {shown(unknown[0])}; only rx, ry and rz "
                 "can be read",
                 where,
+                code="unknown-channel",
             )
         if len(set(bone.dof)) != len(bone.dof):
-            raise PoiseError(f"bone '{bone.name}' names a degree of freedom twice", where)
+            raise PoiseError(
+                f"bone '{bone.name}' names a degree of freedom twice", where, code="channel-repeated"
+            )
 
 
 def _limit(words: list[str], angle: float, where: str) -> tuple[tuple[float, float], ...]:
@@ -218,7 +239,7 @@ def _limit(words: list[str], angle: float, where: str) -> tuple[tuple[float, flo
         else:
             values.append(number(word, where) * angle)
     if len(values) % 2:
-        raise PoiseError(f"limits come in pairs, got {len(values)} numbers", where)
+        raise PoiseError(f"limits come in pairs, got {len(values)} numbers", where, code="count-differs")
     return tuple((values[i], values[i + 1]) for i in range(0, len(values), 2))
 
 
@@ -226,18 +247,21 @@ def _close(asf: AsfFile, bone: Bone) -> None:
     where = at_line(asf.path, bone.line)
     if not bone.name or not bone.name.isprintable():
         what = f"{shown(bone.name)} is no bone name" if bone.name else "a bone has no name"
-        raise PoiseError(what, where)
+        raise PoiseError(what, where, code="not-a-name")
     if bone.name in asf.bones:
-        raise PoiseError(f"bone name '{bone.name}' appears twice", where)
+        raise PoiseError(f"bone name '{bone.name}' appears twice", where, code="name-repeated")
     if len(asf.bones) >= MAX_JOINTS:
-        raise PoiseError(f"more than {MAX_JOINTS} bones", where)
+        raise PoiseError(f"more than {MAX_JOINTS} bones", where, code="too-many-joints")
     if bone.limits and len(bone.limits) != len(bone.dof):
         raise PoiseError(
             f"bone '{bone.name}' has {len(bone.dof)} degrees of freedom but {len(bone.limits)} limits",
             where,
+            code="count-differs",
         )
     if bone.length < 0:
-        raise PoiseError(f"bone '{bone.name}' has the negative length {bone.length:g}", where)
+        raise PoiseError(
+            f"bone '{bone.name}' has the negative length {bone.length:g}", where, code="out-of-range"
+        )
     asf.bones[bone.name] = bone
 
 
@@ -249,19 +273,28 @@ def _hierarchy(asf: AsfFile, lines: list[_Line]) -> None:
         for name in words:
             if name not in asf.bones:
                 raise PoiseError(
-                    f"there is no bone {shown(name)}", where, did_you_mean(name, list(asf.bones))
+                    f"there is no bone {shown(name)}",
+                    where,
+                    did_you_mean(name, list(asf.bones)),
+                    code="unknown-joint",
                 )
         for child in children:
             if child == "root" or child in asf.parents:
-                raise PoiseError(f"bone '{child}' is given a second parent, '{parent}'", where)
+                raise PoiseError(
+                    f"bone '{child}' is given a second parent, '{parent}'", where, code="second-parent"
+                )
             asf.parents[child] = parent
     loose = [name for name in asf.bones if name != "root" and name not in asf.parents]
     if loose:
-        raise PoiseError(f"bone '{loose[0]}' has no place in the :hierarchy", asf.path)
+        raise PoiseError(
+            f"bone '{loose[0]}' has no place in the :hierarchy", asf.path, code="joint-loose"
+        )
     reached = set(asf.joints())
     for name in asf.bones:
         if name not in reached:
-            raise PoiseError(f"the :hierarchy runs in a circle at bone '{name}'", asf.path)
+            raise PoiseError(
+                f"the :hierarchy runs in a circle at bone '{name}'", asf.path, code="hierarchy-cycle"
+            )
 
 
 def fixed_axes_quat(angles: np.ndarray, order: str) -> torch.Tensor:
@@ -292,12 +325,15 @@ def find_skeleton(path: Path) -> tuple[Path, str | None]:
     if len(beside) == 1:
         return beside[0], f"The skeleton {beside[0].name} was taken, the only one in the folder"
     if not beside:
-        raise PoiseError("no ASF skeleton lies beside this AMC file", path, _NAME_SKELETON)
+        raise PoiseError(
+            "no ASF skeleton lies beside this AMC file", path, _NAME_SKELETON, code="skeleton-missing"
+        )
     raise PoiseError(
         f"no skeleton is named for subject '{subject}', and several lie beside it: "
         f"{listed(p.name for p in beside)}",
         path,
         _NAME_SKELETON,
+        code="skeleton-ambiguous",
     )
 
 
@@ -425,7 +461,9 @@ def _frames(path: Path, asf: AsfFile, notes: list[str]) -> tuple[dict[str, np.nd
         head = words[0]
         if head[:1] == b":":
             if numbers:
-                raise PoiseError(f"{shown(head)} stands between frames", at_line(path, i))
+                raise PoiseError(
+                    f"{shown(head)} stands between frames", at_line(path, i), code="line-misplaced"
+                )
             key = head.upper()
             degrees = key == b":DEGREES" if key in (b":DEGREES", b":RADIANS") else degrees
             forced = forced or key == b":FORCE-ALL-JOINTS-BE-3DOF"
@@ -438,7 +476,11 @@ def _frames(path: Path, asf: AsfFile, notes: list[str]) -> tuple[dict[str, np.nd
             frame_line, seen = i, 0
             continue
         if not numbers:
-            raise PoiseError(f"{shown(head)} stands before the first frame number", at_line(path, i))
+            raise PoiseError(
+                f"{shown(head)} stands before the first frame number",
+                at_line(path, i),
+                code="line-misplaced",
+            )
         if head not in known:
             known[head] = _known_bone(asf, decode(head, path, i), forced, at_line(path, i))
         name, width = known[head]
@@ -448,19 +490,24 @@ def _frames(path: Path, asf: AsfFile, notes: list[str]) -> tuple[dict[str, np.nd
                 f"gives it {width}",
                 at_line(path, i),
                 "Is it the right skeleton? Name another with --skeleton FILE",
+                code="row-width",
             )
         column = values.setdefault(name, array("d"))
         if len(places.setdefault(name, [])) >= len(numbers):
-            raise PoiseError(f"joint '{name}' appears twice in frame {numbers[-1]}", at_line(path, i))
+            raise PoiseError(
+                f"joint '{name}' appears twice in frame {numbers[-1]}",
+                at_line(path, i),
+                code="name-repeated",
+            )
         append_numbers(column, words[1:], at_line(path, i))
         places[name].append(i)
         seen += 1
     if not numbers:
-        raise PoiseError("the file has no frames", path, CUT_OFF)
+        raise PoiseError("the file has no frames", path, CUT_OFF, code="no-frames")
     _close_frame(path, values, numbers, frame_line, seen, first_set)
     out = {n: np.array(v).reshape(len(numbers), -1) for n, v in values.items()}
     if "root" not in out:
-        raise PoiseError("no frame lists the root", path)
+        raise PoiseError("no frame lists the root", path, code="root-missing")
     _check_values(path, out, places, numbers)
     still = [n for n, b in asf.bones.items() if n not in out and b.dof]
     if still:
@@ -474,6 +521,7 @@ def _known_bone(asf: AsfFile, name: str, forced: bool, where: str) -> tuple[str,
             f"joint {shown(name)} is not in the skeleton {asf.path.name}",
             where,
             did_you_mean(name, list(asf.bones)),
+            code="unknown-joint",
         )
     return name, len(_columns(asf, name, forced))
 
@@ -482,7 +530,9 @@ def _check_next(path: Path, line: int, last: int, head: bytes) -> None:
     now = int(head[:12])
     if now != last + 1:
         raise PoiseError(
-            f"frame {now} follows frame {last}, so frames are missing or doubled", at_line(path, line)
+            f"frame {now} follows frame {last}, so frames are missing or doubled",
+            at_line(path, line),
+            code="frames-missing",
         )
 
 
@@ -492,13 +542,16 @@ def _close_frame(
     """Checks that a frame lists as many joints as the first one; returns that count."""
     if len(numbers) == 1:
         if seen == 0:
-            raise PoiseError(f"frame {numbers[-1]} lists no joints", at_line(path, line))
+            raise PoiseError(
+                f"frame {numbers[-1]} lists no joints", at_line(path, line), code="frame-incomplete"
+            )
         return seen
     if seen < wanted or len(values) > wanted:
         raise PoiseError(
             f"frame {numbers[-1]} lists {seen} joints, but the first frame {wanted}",
             at_line(path, line),
             "The file seems damaged or cut off",
+            code="frame-incomplete",
         )
     return wanted
 
@@ -516,4 +569,5 @@ def _check_values(
         raise PoiseError(
             f"joint '{name}' at frame {numbers[frame]} has the unusable value {value:g}",
             at_line(path, line),
+            code="number-unusable",
         )

@@ -20,12 +20,12 @@ REFUSED, MEMORY, FAULT = 3, 4, 5
 
 
 class _RefusedError(Exception):
-    """What a job refuses: what was wrong, what to do."""
+    """What a job refuses: what was wrong, what to do, the code of it."""
 
 
-def refuse(what: str, hint: str | None = None) -> NoReturn:
+def refuse(what: str, hint: str | None = None, code: str = "file-damaged") -> NoReturn:
     """Ends a job with one sentence."""
-    raise _RefusedError(what, hint)
+    raise _RefusedError(what, hint, code)
 
 
 def limit(seconds: float, memory: int) -> None:
@@ -62,8 +62,8 @@ def main(script: str, path: str, seconds: str, memory: str, options: str) -> int
         pipe.flush()
         return 0
     except _RefusedError as error:
-        (what, hint), code = error.args, REFUSED
-        answer = {"what": what, "hint": hint}
+        (what, hint, kind), code = error.args, REFUSED
+        answer = {"what": what, "hint": hint, "code": kind}
     except MemoryError:
         answer, code = {}, MEMORY
     except BaseException as error:

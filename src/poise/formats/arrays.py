@@ -94,9 +94,13 @@ def npy_header(file: IO[bytes], where: str | Path) -> Header:
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(file, _HEADER_BYTES)
     except _BAD_HEADER as error:
-        raise PoiseError(f"its NumPy header is damaged ({shown(error)})", where, CUT_OFF) from None
+        raise PoiseError(
+            f"its NumPy header is damaged ({shown(error)})", where, CUT_OFF, code="file-damaged"
+        ) from None
     if min(shape, default=0) < 0:
-        raise PoiseError(f"its NumPy header states the shape {shape}", where, CUT_OFF)
+        raise PoiseError(
+            f"its NumPy header states the shape {shape}", where, CUT_OFF, code="file-damaged"
+        )
     return Header(shape, dtype, fortran)
 
 
@@ -116,7 +120,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """The archive; whatever is wrong with it becomes one sentence."""
     check_file(path, 2 * MAX_ARRAY_BYTES)
     try:
-        crowded = PoiseError(f"the archive holds more than {MAX_KEYS} arrays", path)
+        crowded = PoiseError(f"the archive holds more than {MAX_KEYS} arrays", path, code="over-limit")
         if directory_bytes(path) > MAX_DIRECTORY:
             raise crowded
         with zipfile.ZipFile(path) as archive:
@@ -124,9 +128,13 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
                 raise crowded
             yield archive
     except _DAMAGE as error:
-        raise PoiseError(f"the NumPy archive is damaged ({shown(error)})", path, CUT_OFF) from None
+        raise PoiseError(
+            f"the NumPy archive is damaged ({shown(error)})", path, CUT_OFF, code="file-damaged"
+        ) from None
     except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror or error})", path) from None
+        raise PoiseError(
+            f"the file cannot be read ({error.strerror or error})", path, code="file-unreadable"
+        ) from None
 
 
 class Archive(Mapping[str, Any]):
@@ -174,10 +182,10 @@ def read_npy(file: IO[bytes], where: str | Path, unpickle: Unpickle | None = Non
     header = npy_header(file, where)
     if header.dtype.hasobject:
         if unpickle is None:
-            raise PoiseError("it holds pickled objects", where, ASK)
+            raise PoiseError("it holds pickled objects", where, ASK, code="pickle-refused")
         data = file.read(MAX_ARRAY_BYTES + 1)
         if len(data) > MAX_ARRAY_BYTES:
-            raise PoiseError("it holds more pickled data than the limit", where)
+            raise PoiseError("it holds more pickled data than the limit", where, code="over-limit")
         return unpickle(data, where)
     size = math.prod(header.shape) * header.dtype.itemsize
     if size > MAX_ARRAY_BYTES:
@@ -186,21 +194,29 @@ def read_npy(file: IO[bytes], where: str | Path, unpickle: Unpickle | None = Non
             f"than the limit of {MAX_ARRAY_BYTES / 1e9:.2f} GB",
             where,
             "Cut it into shorter clips",
+            code="file-too-big",
         )
     # One byte more than needed, so that the checksum at the end is looked at.
     data = file.read(size + 1)
     if len(data) != size:
         there = f"only {len(data)}" if len(data) < size else "more"
         raise PoiseError(
-            f"it states the shape {header.shape} of {size} bytes, but {there} are there", where, CUT_OFF
+            f"it states the shape {header.shape} of {size} bytes, but {there} are there",
+            where,
+            CUT_OFF,
+            code="file-cut-off",
         )
     try:
         flat = np.frombuffer(data, header.dtype) if size else np.zeros(0, header.dtype)
         if no_text(flat):
-            raise PoiseError("it holds characters that do not exist", where, CUT_OFF)
+            raise PoiseError(
+                "it holds characters that do not exist", where, CUT_OFF, code="file-damaged"
+            )
         return flat.reshape(header.shape, order="F" if header.fortran else "C")
     except ValueError:
-        raise PoiseError(f"its shape {header.shape} makes no array", where, CUT_OFF) from None
+        raise PoiseError(
+            f"its shape {header.shape} makes no array", where, CUT_OFF, code="file-damaged"
+        ) from None
 
 
 def no_text(flat: np.ndarray) -> bool:
@@ -222,7 +238,7 @@ def require(data: Mapping[str, Any], keys: Sequence[str], path: Path, what: str)
     missing = [k for k in keys if k not in data]
     if missing:
         hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It is empty"
-        raise PoiseError(f"{what} lacks {listed(missing)}", path, hint)
+        raise PoiseError(f"{what} lacks {listed(missing)}", path, hint, code="key-missing")
 
 
 def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path) -> np.ndarray:
@@ -230,14 +246,14 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
     where = f"{path}, array {shown(key)}"
     value = np.asarray(data[key])
     if value.dtype.kind not in "fiu":
-        raise PoiseError(f"it holds {value.dtype.name} values, not numbers", where)
+        raise PoiseError(f"it holds {value.dtype.name} values, not numbers", where, code="wrong-type")
     fits = value.ndim == len(shape) and all(
         b in (None, a) for a, b in zip(value.shape, shape, strict=False)
     )
     if not fits:
         wanted = " x ".join("any" if n is None else str(n) for n in shape)
         found = " x ".join(map(str, value.shape)) or "()"
-        raise PoiseError(f"it has the shape {found}, not {wanted}", where)
+        raise PoiseError(f"it has the shape {found}, not {wanted}", where, code="wrong-shape")
     # Numbers that double precision lacks become infinite, which is refused where they are used.
     with np.errstate(over="ignore", invalid="ignore"):
         return value.astype(np.float64)
@@ -249,7 +265,9 @@ def one_number(data: Mapping[str, Any], key: str, path: Path) -> float:
         return rate
     value = float(numeric({key: np.ravel(np.asarray(data[key]))}, key, (1,), path)[0])
     if not np.isfinite(value):
-        raise PoiseError(f"it holds {value}, not a finite number", f"{path}, array {shown(key)}")
+        raise PoiseError(
+            f"it holds {value}, not a finite number", f"{path}, array {shown(key)}", code="not-finite"
+        )
     return value
 
 
@@ -279,7 +297,9 @@ def refuse_bad(table: np.ndarray, what: str, where: str | Path, names: Sequence[
     at = np.argwhere(bad)[0]
     joint = f" of joint '{names[at[1]]}'" if names else ""
     raise PoiseError(
-        f"{what}{joint} at frame {at[0]} is {table[tuple(at)]:.4g}, not a usable number", where
+        f"{what}{joint} at frame {at[0]} is {table[tuple(at)]:.4g}, not a usable number",
+        where,
+        code="number-unusable",
     )
 
 

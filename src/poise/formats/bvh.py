@@ -227,15 +227,19 @@ def write_bvh(
     path = Path(path)
     order = order.upper()
     if sorted(order) != ["X", "Y", "Z"]:
-        raise PoiseError(f"the rotation order must name X, Y and Z once each, got '{order}'")
+        raise PoiseError(
+            f"the rotation order must name X, Y and Z once each, got '{order}'", code="bad-axis-order"
+        )
     source = clip.skeleton.source
     own = source.format == "bvh" and len(source.channels) == len(clip.skeleton)
     unit = unit_m if unit_m is not None else (source.unit_m if own else 0.01)
     axis = (up_axis or (source.up_axis if own else "Y")).upper()
     if not (np.isfinite(unit) and unit > 0):
-        raise PoiseError(f"the unit must be above 0 metres, got {unit}")
+        raise PoiseError(f"the unit must be above 0 metres, got {unit}", code="out-of-range")
     if axis not in UPS:
-        raise PoiseError(f"the up axis must be one of {', '.join(UPS)}, got '{axis}'")
+        raise PoiseError(
+            f"the up axis must be one of {', '.join(UPS)}, got '{axis}'", code="unknown-axis"
+        )
     rot = quats_from_z_up(clip.rot, axis)
     offsets = vectors_from_z_up(clip.skeleton.offsets, axis) / unit
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit

@@ -64,7 +64,9 @@ class _Tokens:
         self.motion_line: int | None = None
         for i, line in enumerate(lines):
             if len(self.words) > MAX_HEADER_WORDS:
-                raise PoiseError(f"no MOTION in the first {MAX_HEADER_WORDS} words", path)
+                raise PoiseError(
+                    f"no MOTION in the first {MAX_HEADER_WORDS} words", path, code="over-limit"
+                )
             parts = decode(line, path, i + 1).replace("{", " { ").replace("}", " } ").split()
             if parts and parts[0].upper() == "MOTION":
                 self.motion_line = i
@@ -82,7 +84,9 @@ class _Tokens:
     def next(self, wanted: str) -> str:
         if self.done():
             cut = "MOTION starts" if self.motion_line is not None else "the file ends"
-            raise PoiseError(f"{cut} where {wanted} was expected", self.place(), CUT_OFF)
+            raise PoiseError(
+                f"{cut} where {wanted} was expected", self.place(), CUT_OFF, code="file-cut-off"
+            )
         word = self.words[self.at][0]
         self.at += 1
         return word
@@ -91,7 +95,9 @@ class _Tokens:
         got = self.next(f"'{word}'")
         if got.upper() != word.upper():
             self.at -= 1
-            raise PoiseError(f"'{word}' was expected, got {shown(got)}", self.place())
+            raise PoiseError(
+                f"'{word}' was expected, got {shown(got)}", self.place(), code="keyword-expected"
+            )
 
     def vector(self) -> tuple[float, float, float]:
         out = []
@@ -111,7 +117,7 @@ class _Tokens:
         name = " ".join(words)
         if not name or not name.isprintable() or len(name) > MAX_NAME:
             what = "a joint has no name" if not name else f"{shown(name)} is no joint name"
-            raise PoiseError(what, at_line(self.path, line))
+            raise PoiseError(what, at_line(self.path, line), code="not-a-name")
         return name
 
 
@@ -127,7 +133,7 @@ def parse_bvh(path: Path, rest: bool = False) -> BvhFile:
     if tokens.motion_line is None and rest:
         return _one_body(_rested(joints, sum(len(j.channels or ()) for j in joints)), hierarchy.roots)
     if tokens.motion_line is None:
-        raise PoiseError("the file ends before MOTION", path, CUT_OFF)
+        raise PoiseError("the file ends before MOTION", path, CUT_OFF, code="file-cut-off")
     return _one_body(_motion(lines, tokens.motion_line + 1, joints, path, rest), hierarchy.roots)
 
 
@@ -172,7 +178,9 @@ class _Hierarchy:
                 self.stack.append(-1)
             elif word == "}":
                 if not self.stack:
-                    raise PoiseError("a closing brace has no opening one", self.place)
+                    raise PoiseError(
+                        "a closing brace has no opening one", self.place, code="brace-unmatched"
+                    )
                 self.stack.pop()
             elif word == "OFFSET":
                 self._offset(tokens.vector())
@@ -184,13 +192,14 @@ class _Hierarchy:
                     f"{shown(word)} is not a BVH keyword",
                     self.place,
                     "Known: ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION",
+                    code="unknown-keyword",
                 )
         self._check_closed()
         return self.joints
 
     def _need_joint(self, otherwise: str) -> None:
         if not self.stack or self.stack[-1] < 0:
-            raise PoiseError(otherwise, self.place)
+            raise PoiseError(otherwise, self.place, code="line-misplaced")
 
     def _open_joint(self, word: str) -> None:
         line = self.tokens.words[self.tokens.at - 1][1]
@@ -198,7 +207,7 @@ class _Hierarchy:
         if word == "JOINT":
             self._need_joint(f"joint '{name}' stands outside any other joint")
         if word == "ROOT" and self.stack:
-            raise PoiseError(f"ROOT '{name}' stands inside a joint", self.place)
+            raise PoiseError(f"ROOT '{name}' stands inside a joint", self.place, code="line-misplaced")
         if word == "ROOT" and self.joints:
             # A second body may have the names of the first.
             self.roots.append(len(self.joints))
@@ -208,9 +217,10 @@ class _Hierarchy:
                 f"joint name '{name}' appears twice (first in line {self.known[name]})",
                 self.place,
                 "Rename one of them",
+                code="name-repeated",
             )
         if len(self.joints) >= MAX_JOINTS:
-            raise PoiseError(f"more than {MAX_JOINTS} joints", self.place)
+            raise PoiseError(f"more than {MAX_JOINTS} joints", self.place, code="too-many-joints")
         self.tokens.expect("{")
         self.known[name] = line
         self.joints.append(BvhJoint(name, self.stack[-1] if self.stack else -1, line))
@@ -218,12 +228,12 @@ class _Hierarchy:
 
     def _offset(self, vector: tuple[float, float, float]) -> None:
         if not self.stack:
-            raise PoiseError("an OFFSET stands outside any joint", self.place)
+            raise PoiseError("an OFFSET stands outside any joint", self.place, code="line-misplaced")
         joint = self.joints[self.stack[-1] if self.stack[-1] >= 0 else self.stack[-2]]
         if self.stack[-1] < 0:
             joint.tips.append(vector)
         elif joint.offset is not None:
-            raise PoiseError(f"joint '{joint.name}' has two OFFSETs", self.place)
+            raise PoiseError(f"joint '{joint.name}' has two OFFSETs", self.place, code="line-repeated")
         else:
             joint.offset = vector
 
@@ -231,9 +241,11 @@ class _Hierarchy:
         count = self.tokens.next("the number of channels")
         if not (count.isdigit() and count.isascii()) or int(count) > 6:
             what = f"joint '{joint.name}' must have 0 to 6 channels, got {shown(count)}"
-            raise PoiseError(what, self.place)
+            raise PoiseError(what, self.place, code="channel-count")
         if joint.channels is not None:
-            raise PoiseError(f"joint '{joint.name}' has two CHANNELS lines", self.place)
+            raise PoiseError(
+                f"joint '{joint.name}' has two CHANNELS lines", self.place, code="line-repeated"
+            )
         channels = []
         for _ in range(int(count)):
             word = self.tokens.next("a channel name")
@@ -242,24 +254,29 @@ class _Hierarchy:
                     f"{shown(word)} is not a channel of joint '{joint.name}'",
                     self.place,
                     f"Known: {', '.join(_CANONICAL.values())}",
+                    code="unknown-channel",
                 )
             channels.append(_CANONICAL[word.lower()])
         if len(set(channels)) != len(channels):
-            raise PoiseError(f"joint '{joint.name}' names a channel twice", self.place)
+            raise PoiseError(
+                f"joint '{joint.name}' names a channel twice", self.place, code="channel-repeated"
+            )
         joint.channels = tuple(channels)
 
     def _check_closed(self) -> None:
         place = self.tokens.place()
         if not self.joints:
-            raise PoiseError("the hierarchy has no ROOT", place, CUT_OFF)
+            raise PoiseError("the hierarchy has no ROOT", place, CUT_OFF, code="root-missing")
         if self.stack:
             name = next(self.joints[j].name for j in reversed(self.stack) if j >= 0)
-            raise PoiseError(f"the brace of joint '{name}' is never closed", place, CUT_OFF)
+            raise PoiseError(
+                f"the brace of joint '{name}' is never closed", place, CUT_OFF, code="brace-unmatched"
+            )
         for joint in self.joints:
             for what, value in (("OFFSET", joint.offset), ("CHANNELS", joint.channels)):
                 if value is None:
                     where = at_line(self.tokens.path, joint.line)
-                    raise PoiseError(f"joint '{joint.name}' has no {what}", where)
+                    raise PoiseError(f"joint '{joint.name}' has no {what}", where, code="part-missing")
 
 
 def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path, rest: bool) -> BvhFile:
@@ -271,6 +288,7 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path, 
         raise PoiseError(
             f"the number of frames is {shown(count_text)}, which is no whole number",
             at_line(path, count_line),
+            code="not-a-number",
         )
     # More digits than this cannot be met by any file within the size limit.
     stated = int(count_text[:12])
@@ -280,12 +298,16 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path, 
     frame_time = number(time_text, at_line(path, time_line))
     if frame_time <= 0:
         raise PoiseError(
-            f"the frame time is {frame_time:g} s, which must be above 0", at_line(path, time_line)
+            f"the frame time is {frame_time:g} s, which must be above 0",
+            at_line(path, time_line),
+            code="rate-out-of-range",
         )
     if not stated:
-        raise PoiseError("the file has no frame of motion", at_line(path, count_line), NO_ANIMATION)
+        raise PoiseError(
+            "the file has no frame of motion", at_line(path, count_line), NO_ANIMATION, code="no-frames"
+        )
     if width == 0:
-        raise PoiseError("no joint has any channel, so nothing moves", path)
+        raise PoiseError("no joint has any channel, so nothing moves", path, code="no-channels")
     values: array[float] = array("d")
     numbers: list[int] = []
     extra = 0
@@ -297,6 +319,7 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path, 
             raise PoiseError(
                 f"the row of frame {len(numbers)} has {len(tokens)} numbers; the channels need {width}",
                 at_line(path, line),
+                code="row-width",
             )
         append_numbers(values, tokens, at_line(path, line))
         numbers.append(line)
@@ -305,6 +328,7 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path, 
             f"{stated} frames are stated, but only {len(numbers)} rows follow",
             at_line(path, count_line),
             CUT_OFF,
+            code="frames-missing",
         )
     table = np.frombuffer(values).reshape(-1, width)
     if rest and stated == 1:
@@ -332,13 +356,17 @@ def _entry(rows, key: bytes, path: Path, end: int) -> tuple[int, bytes]:  # type
     """The line and value of "Frames: N" or "Frame Time: S"."""
     line, tokens = next(rows, (end, None))
     if tokens is None:
-        raise PoiseError(f"the file ends before '{key.decode()}'", path, CUT_OFF)
+        raise PoiseError(f"the file ends before '{key.decode()}'", path, CUT_OFF, code="file-cut-off")
     text = b" ".join(tokens)
     if not text.lower().startswith(key.lower()):
-        raise PoiseError(f"'{key.decode()}' was expected, got {shown(text)}", at_line(path, line))
+        raise PoiseError(
+            f"'{key.decode()}' was expected, got {shown(text)}",
+            at_line(path, line),
+            code="keyword-expected",
+        )
     value = text[len(key) :].strip()
     if not value:
-        raise PoiseError(f"'{key.decode()}' has no value", at_line(path, line))
+        raise PoiseError(f"'{key.decode()}' has no value", at_line(path, line), code="part-missing")
     return line, value
 
 
@@ -352,5 +380,7 @@ def _check_values(table: np.ndarray, joints: list[BvhJoint], lines: list[int], p
     value = table[frame, column]
     what = f"larger than {MAX_VALUE:g}" if np.isfinite(value) else "not a finite number"
     raise PoiseError(
-        f"{channel} of joint '{name}' at frame {frame} is {value:g}, {what}", at_line(path, lines[frame])
+        f"{channel} of joint '{name}' at frame {frame} is {value:g}, {what}",
+        at_line(path, lines[frame]),
+        code="number-unusable",
     )

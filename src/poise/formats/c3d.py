@@ -39,7 +39,10 @@ def c3d_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     """
     if find_spec("ezc3d") is None:
         raise PoiseError(
-            "C3D files need the package ezc3d", path, "Install it with pip install 'poise-motion[c3d]'"
+            "C3D files need the package ezc3d",
+            path,
+            "Install it with pip install 'poise-motion[c3d]'",
+            code="extra-missing",
         )
     size = _check_header(path)
     # Damaged files make the C++ library loop without end or take any memory.
@@ -52,6 +55,7 @@ def c3d_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
             f"it holds {points.shape[1]} points and {len(labels)} labels",
             path,
             "Label the markers in the capture software and export again",
+            code="count-differs",
         )
     missing = residuals[0, : len(labels)] < 0
     positions = np.where(missing.T[..., None], np.nan, points[:3, : len(labels)].transpose(2, 1, 0))
@@ -60,7 +64,9 @@ def c3d_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     if unit_name not in UNITS_M:
         notes.append(f"The unit {shown(unit_name)} is not known" if unit_name else "No unit is stated")
     if not rate > 0:
-        raise PoiseError(f"the frame rate is {rate:g}", path, "The file seems damaged")
+        raise PoiseError(
+            f"the frame rate is {rate:g}", path, "The file seems damaged", code="rate-out-of-range"
+        )
     return RawPoints(
         "c3d",
         path,
@@ -79,7 +85,9 @@ def _check_header(path: Path) -> int:
     with path.open("rb") as file:
         head = file.read(_BLOCK)
     if len(head) < _BLOCK or head[1] != _KEY:
-        raise PoiseError("this is not a C3D file (its second byte is not 0x50)", path)
+        raise PoiseError(
+            "this is not a C3D file (its second byte is not 0x50)", path, code="wrong-format"
+        )
     points = int.from_bytes(head[2:4], "little")
     first, last = (int.from_bytes(head[k : k + 2], "little") for k in (6, 8))
     start = int.from_bytes(head[16:18], "little")
@@ -90,9 +98,12 @@ def _check_header(path: Path) -> int:
             f"its header states {frames} frames of {points} points, which do not fit into {size} bytes",
             path,
             CUT_OFF,
+            code="file-cut-off",
         )
     if (start - 1) * _BLOCK > size or (head[0] - 1) * _BLOCK >= size:
-        raise PoiseError("its header points beyond the end of the file", path, CUT_OFF)
+        raise PoiseError(
+            "its header points beyond the end of the file", path, CUT_OFF, code="file-cut-off"
+        )
     return size
 
 

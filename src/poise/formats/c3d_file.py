@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 
-def read(path: str, refuse: Callable[[str], None]) -> dict[str, np.ndarray]:
+def read(path: str, refuse: Callable[..., None]) -> dict[str, np.ndarray]:
     """Points, residuals, rate, and the text parameters of the group POINT."""
     import ezc3d
 

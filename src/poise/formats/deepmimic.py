@@ -60,11 +60,15 @@ def read_deepmimic(path: Path, options: ReadOptions) -> Clip:
     """
     data = json_object(read_bytes(path, MAX_JSON_BYTES), path)
     if not isinstance(data.get("Frames"), list):
-        raise PoiseError("the JSON has no list named 'Frames'", path, "DeepMimic files need one")
+        raise PoiseError(
+            "the JSON has no list named 'Frames'", path, "DeepMimic files need one", code="key-missing"
+        )
     table = _table(data["Frames"], path)
     loop = data.get("Loop", "none")
     if loop not in ("wrap", "none"):
-        raise PoiseError(f"Loop must be wrap or none, got {str(loop)[:30]!r}", path)
+        raise PoiseError(
+            f"Loop must be wrap or none, got {str(loop)[:30]!r}", path, code="unknown-choice"
+        )
     notes: list[str] = []
     joints = _humanoid()
     names = tuple(j[0] for j in joints)
@@ -104,14 +108,18 @@ def _table(frames: list[Any], path: Path) -> np.ndarray:
     for i, row in enumerate(frames):
         count = len(row) if isinstance(row, list) else 0
         if count != COLUMNS:
-            raise PoiseError(f"it has {count} numbers, not {COLUMNS}", f"{path}, frame {i}")
+            raise PoiseError(
+                f"it has {count} numbers, not {COLUMNS}", f"{path}, frame {i}", code="row-width"
+            )
         for k, value in enumerate(row):
             if type(value) not in (int, float) or not abs(value) <= MAX_VALUE:
                 raise PoiseError(
-                    f"column {k} holds {str(value)[:30]!r}, no usable number", f"{path}, frame {i}"
+                    f"column {k} holds {str(value)[:30]!r}, no usable number",
+                    f"{path}, frame {i}",
+                    code="number-unusable",
                 )
     if not frames:
-        raise PoiseError("the list 'Frames' is empty", path)
+        raise PoiseError("the list 'Frames' is empty", path, code="no-frames")
     return np.array(frames, dtype=np.float64)
 
 
@@ -135,6 +143,7 @@ def _rotations(
                 raise PoiseError(
                     f"the quaternion of joint '{name}' has length {norm[frame]:.3g}, no rotation",
                     f"{path}, frame {frame}",
+                    code="not-a-rotation",
                 )
             worst = max(worst, (float(abs(norm[frame] - 1)), name, frame))
             off = np.flatnonzero(np.abs(norm - 1) > _NORM_NOTE)
@@ -165,7 +174,9 @@ def _times(durations: np.ndarray, path: Path) -> tuple[np.ndarray, bool]:
     bad = np.flatnonzero(~(times > 0))
     if len(bad):
         raise PoiseError(
-            f"its duration is {times[bad[0]]:g} s, which must be above 0", f"{path}, frame {bad[0]}"
+            f"its duration is {times[bad[0]]:g} s, which must be above 0",
+            f"{path}, frame {bad[0]}",
+            code="out-of-range",
         )
     step = np.median(times)
     return times, bool(np.abs(times / step - 1).max() > _TIME_SLACK)
@@ -176,7 +187,9 @@ def _even(clip: Clip, times: np.ndarray, path: Path) -> Clip:
     at = np.concatenate(([0.0], np.cumsum(times)))
     count = max(2, int(np.floor(at[-1] * clip.fps + 1e-3)) + 1)
     if count > 100 * clip.frames:
-        raise PoiseError("its frame durations differ too much to be evened out", path)
+        raise PoiseError(
+            "its frame durations differ too much to be evened out", path, code="times-uneven"
+        )
     wanted = np.minimum(np.arange(count) / clip.fps, at[-1])
     low = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, clip.frames - 2)
     t = np.clip((wanted - at[low]) / times[low], 0.0, 1.0)

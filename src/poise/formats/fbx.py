@@ -30,7 +30,7 @@ def read_fbx(path: Path, options: ReadOptions) -> Clip:
         PoiseError: ufbx is not installed, the file is damaged, or holds no bones or no animation.
     """
     if find_spec("ufbx") is None:
-        raise PoiseError("FBX files need the package ufbx", path, _MISSING)
+        raise PoiseError("FBX files need the package ufbx", path, _MISSING, code="extra-missing")
     size = check_file(path)
     limits = {"joints": MAX_JOINTS, "poses": MAX_POSES, "value": MAX_VALUE}
     stated = {"fps": options.fps, "take": options.take, "rest": options.rest}

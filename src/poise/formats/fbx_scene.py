@@ -35,7 +35,11 @@ def read(
             target_axes=ufbx.axes_right_handed_y_up,
         )  # fmt: skip
     except ufbx.UfbxError as error:
-        refuse(f"ufbx cannot read the file ({error})", "It seems cut off or is no FBX file")
+        refuse(
+            f"ufbx cannot read the file ({error})",
+            "It seems cut off or is no FBX file",
+            code="file-damaged",
+        )
     notes: list[str] = []
     # ufbx's Python objects are asked for once and kept: some fail when they are made again.
     stacks, nodes = list(scene.anim_stacks), list(scene.nodes)
@@ -44,7 +48,7 @@ def read(
     begin = float(stack.time_begin) if stack else 0.0
     length = float(stack.time_end) - begin if stack else 0.0
     if not (0 < rate <= value and abs(begin) <= value and 0 <= length <= value):
-        refuse("its times are no usable numbers")
+        refuse("its times are no usable numbers", code="times-unusable")
     # A single pose stands for two frames.
     count = max(2, round(length * rate) + 1)
     times = begin + (np.arange(count) / rate if length > 0 else np.zeros(count))
@@ -58,12 +62,13 @@ def read(
     names = [n.name for n in nodes]
     order, parents = skeleton(above, bones, moves, refuse, notes, names)
     if len(order) > joints:
-        refuse(f"it has {len(order)} joints; 1 to {joints} are read")
+        refuse(f"it has {len(order)} joints; 1 to {joints} are read", code="joint-count")
     if count * len(order) > min(poses, POSES):
         refuse(
             f"it has {count} frames of {len(order)} joints, more than the {min(poses, POSES)} poses "
             "that are read",
             "Cut it shorter, or state a lower rate with --fps F",
+            code="clip-too-long",
         )
     local = np.stack([_matrices(nodes[k], anim, times) for k in order], axis=1)
     top, base = above[order[0]], np.eye(4)
@@ -101,6 +106,7 @@ def _take(stacks: list[Any], wanted: str | None, rest: bool, refuse: Refuse, not
         refuse(
             "the file holds no animation",
             "Export it with its animation baked; as it rests it serves `poise retarget --onto` alone",
+            code="no-animation",
         )
     if wanted is None:
         if len(stacks) > 1:
@@ -113,7 +119,9 @@ def _take(stacks: list[Any], wanted: str | None, rest: bool, refuse: Refuse, not
         if wanted in (stack.name, str(k)):
             return stack
     refuse(
-        f"it has no take {wanted[:40]!r}", f"It has {', '.join(repr(s.name[:40]) for s in stacks[:6])}"
+        f"it has no take {wanted[:40]!r}",
+        f"It has {', '.join(repr(s.name[:40]) for s in stacks[:6])}",
+        code="unknown-take",
     )
 
 
@@ -146,7 +154,7 @@ def skeleton(
         within[k] = above[k] >= 0 and (within[above[k]] or bones[above[k]])
     roots = [k for k in down if bones[k] and not within[k]]
     if not roots:
-        refuse("the file holds no bones", "Export the skeleton too, not only meshes")
+        refuse("the file holds no bones", "Export the skeleton too, not only meshes", code="no-joints")
     root = max(roots, key=lambda k: weight[k])
     heads = [False] * len(above)
     for k in reversed(down):

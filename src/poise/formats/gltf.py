@@ -141,7 +141,11 @@ def _scale(tree: Tree, take: Take, node: int, file: GltfFile, notes: list[str]) 
         notes.append(f"The scale of '{name}' is animated; its median was taken for all frames")
     if value.min() <= 0:
         what = "mirrors space" if value.min() < 0 else "is zero"
-        raise PoiseError(f"the scale of node '{name}' {what}, which no body can follow", file.path)
+        raise PoiseError(
+            f"the scale of node '{name}' {what}, which no body can follow",
+            file.path,
+            code="scale-unusable",
+        )
     if value.max() > (1 + _EVEN_SCALE) * value.min():
         notes.append(
             f"The scale of '{name}' differs between its axes; below its children the mean is used"
@@ -172,7 +176,7 @@ def _clock(
     of the keys. Times that are a key up to float32 noise become that key exactly.
     """
     if not tracks and take.tracks:
-        raise PoiseError("the animation moves no joint of the figure", file.path)
+        raise PoiseError("the animation moves no joint of the figure", file.path, code="nothing-moves")
     if not tracks:
         return np.zeros(2), fps or _USUAL_HZ
     inputs = {id(t.times): t.times for t in tracks}.values()

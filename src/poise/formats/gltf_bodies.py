@@ -35,7 +35,9 @@ def choose_joints(
     skin = _skin_joints(tree, file, targeted, notes)
     bare = set(targeted) or {n for n in range(len(tree.names)) if not tree.solid[n]}
     if not skin and not bare:
-        raise PoiseError("the file holds no joints", file.path, "Export its skeleton too")
+        raise PoiseError(
+            "the file holds no joints", file.path, "Export its skeleton too", code="no-joints"
+        )
     wanted = set(skin) if skin else _biggest_tree(tree, bare)
     if not skin and wanted != bare:
         others = sorted(tree.names[n] for n in bare - wanted)
@@ -43,7 +45,11 @@ def choose_joints(
             f"{len(others)} animated nodes outside the figure were left out, such as '{others[0]}'"
         )
     if len(wanted) > MAX_JOINTS:
-        raise PoiseError(f"it has {len(wanted)} joints, more than the {MAX_JOINTS} allowed", file.path)
+        raise PoiseError(
+            f"it has {len(wanted)} joints, more than the {MAX_JOINTS} allowed",
+            file.path,
+            code="too-many-joints",
+        )
     best = _biggest_tree(tree, wanted)
     if best != wanted:
         notes.append(f"{len(wanted - best)} joints that hang on no common node were left out")
@@ -52,7 +58,11 @@ def choose_joints(
     joints, root = _connected(tree, best)
     joints |= _animated_below(tree, joints, root, targeted) if skin else _hanging_on(tree, joints)
     if len(joints) > MAX_JOINTS:
-        raise PoiseError(f"it has {len(joints)} joints, more than the {MAX_JOINTS} allowed", file.path)
+        raise PoiseError(
+            f"it has {len(joints)} joints, more than the {MAX_JOINTS} allowed",
+            file.path,
+            code="too-many-joints",
+        )
     order = [j for j in skin if j in joints]
     if len(order) == len(joints) and _parents_first(tree, order, root):
         return order
@@ -106,7 +116,7 @@ def _skin_joints(tree: Tree, file: GltfFile, targeted: set[int], notes: list[str
     for i, skin in enumerate(file.doc["skins"]):
         joints = skin.get("joints", [])
         if not isinstance(joints, list):
-            raise PoiseError(f"the joints of skin {i} are no list", file.path)
+            raise PoiseError(f"the joints of skin {i} are no list", file.path, code="not-a-list")
         found = [index_of(j, tree.names, f"a joint of skin {i}", file) for j in joints]
         skins.append(list(dict.fromkeys(found)))
     bodies = _bodies(tree, file, [s for s in skins if s], targeted)

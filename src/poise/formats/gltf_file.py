@@ -53,6 +53,7 @@ class GltfFile:
                 f"its animation has more than {MAX_ELEMENTS} keys",
                 self.path,
                 "Cut it into shorter clips",
+                code="clip-too-long",
             )
 
     def buffer(self, index: int) -> bytes:
@@ -64,10 +65,18 @@ class GltfFile:
     def _load(self, index: int) -> bytes:
         length, uri = (self.doc["buffers"][index].get(key) for key in ("byteLength", "uri"))
         if type(length) is not int or not 0 < length <= MAX_FILE_BYTES:
-            raise PoiseError(f"buffer {index} states a length of {shown(length)} bytes", self.path)
+            raise PoiseError(
+                f"buffer {index} states a length of {shown(length)} bytes",
+                self.path,
+                code="number-unusable",
+            )
         if uri is None:
             if index != 0 or self.blob is None:
-                raise PoiseError(f"buffer {index} has neither an address nor a GLB chunk", self.path)
+                raise PoiseError(
+                    f"buffer {index} has neither an address nor a GLB chunk",
+                    self.path,
+                    code="data-missing",
+                )
             data = self.blob
         elif uri.startswith(_DATA_URI):
             data = _embedded(uri, index, self.path)
@@ -78,6 +87,7 @@ class GltfFile:
                 f"buffer {index} has {len(data)} bytes, but the document states {length}",
                 self.path,
                 CUT_OFF,
+                code="file-cut-off",
             )
         return data[:length]
 
@@ -91,7 +101,9 @@ def load_gltf(path: Path) -> GltfFile:
     data = read_binary(path)
     text, blob = _chunks(data, path) if data[:4] == MAGIC else (data, None)
     if text.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
-        raise PoiseError("this is no glTF: it starts with neither 'glTF' nor '{'", path)
+        raise PoiseError(
+            "this is no glTF: it starts with neither 'glTF' nor '{'", path, code="wrong-format"
+        )
     doc = json_object(text, path)
     _check_version(doc, path)
     _check_parts(doc, path)
@@ -101,13 +113,23 @@ def load_gltf(path: Path) -> GltfFile:
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     """The JSON and the binary chunk of a GLB container."""
     if len(data) < 20:
-        raise PoiseError(f"a GLB file needs at least 20 bytes, this has {len(data)}", path, CUT_OFF)
+        raise PoiseError(
+            f"a GLB file needs at least 20 bytes, this has {len(data)}",
+            path,
+            CUT_OFF,
+            code="file-cut-off",
+        )
     version, total = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise PoiseError(f"this is GLB version {version}", path, "Export it as glTF 2.0")
+        raise PoiseError(
+            f"this is GLB version {version}", path, "Export it as glTF 2.0", code="version-unsupported"
+        )
     if total > len(data):
         raise PoiseError(
-            f"the GLB header states {total} bytes, but {len(data)} are there", path, CUT_OFF
+            f"the GLB header states {total} bytes, but {len(data)} are there",
+            path,
+            CUT_OFF,
+            code="file-cut-off",
         )
     found: dict[int, bytes] = {}
     at = 12
@@ -116,14 +138,19 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
         if at + 8 + length > total:
             left = total - at - 8
             raise PoiseError(
-                f"the chunk at byte {at} states {length} bytes, but {left} are left", path, CUT_OFF
+                f"the chunk at byte {at} states {length} bytes, but {left} are left",
+                path,
+                CUT_OFF,
+                code="file-cut-off",
             )
         if at == 12 and kind != JSON_CHUNK:
-            raise PoiseError("the first chunk of the GLB is not JSON", path)
+            raise PoiseError("the first chunk of the GLB is not JSON", path, code="bad-json")
         found.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
     if JSON_CHUNK not in found:
-        raise PoiseError(f"the GLB header states {total} bytes, which hold no JSON", path, CUT_OFF)
+        raise PoiseError(
+            f"the GLB header states {total} bytes, which hold no JSON", path, CUT_OFF, code="bad-json"
+        )
     return found[JSON_CHUNK], found.get(BIN_CHUNK)
 
 
@@ -131,9 +158,16 @@ def _check_version(content: dict[str, Any], path: Path) -> None:
     asset = content.get("asset")
     version = asset.get("version") if isinstance(asset, dict) else None
     if not isinstance(version, str):
-        raise PoiseError("the document states no glTF version (asset.version)", path)
+        raise PoiseError(
+            "the document states no glTF version (asset.version)", path, code="part-missing"
+        )
     if not version.startswith("2."):
-        raise PoiseError(f"this is glTF version {shown(version)}", path, "Export it as glTF 2.0")
+        raise PoiseError(
+            f"this is glTF version {shown(version)}",
+            path,
+            "Export it as glTF 2.0",
+            code="version-unsupported",
+        )
 
 
 def _check_parts(content: dict[str, Any], path: Path) -> None:
@@ -151,33 +185,39 @@ def _check_parts(content: dict[str, Any], path: Path) -> None:
             _check_object(sparse, part, path)
     for i, buffer in enumerate(content["buffers"]):
         if not isinstance(buffer.get("uri"), str | None):
-            raise PoiseError(f"the address of buffer {i} is no text", path)
+            raise PoiseError(f"the address of buffer {i} is no text", path, code="wrong-type")
 
 
 def _check_list(holder: dict[str, Any], key: str, what: str, most: int, path: Path) -> None:
     items = holder.setdefault(key, [])
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise PoiseError(f"{what} is not a list of objects", path)
+        raise PoiseError(f"{what} is not a list of objects", path, code="not-a-list")
     if len(items) > most:
-        raise PoiseError(f"{what} has {len(items)} entries, more than the {most} allowed", path)
+        raise PoiseError(
+            f"{what} has {len(items)} entries, more than the {most} allowed", path, code="over-limit"
+        )
 
 
 def _check_object(holder: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
     """The object under a key, empty where there is none."""
     value = holder.get(key)
     if not isinstance(value, dict | None):
-        raise PoiseError(f"'{key}' is no object, as glTF demands", path)
+        raise PoiseError(f"'{key}' is no object, as glTF demands", path, code="not-an-object")
     return value or {}
 
 
 def _embedded(uri: str, index: int, path: Path) -> bytes:
     head, comma, body = uri.partition(",")
     if not comma or not head.endswith(";base64") or len(body) > MAX_EMBEDDED_BYTES:
-        raise PoiseError(f"the embedded buffer {index} is not base64 of a usable size", path)
+        raise PoiseError(
+            f"the embedded buffer {index} is not base64 of a usable size", path, code="bad-base64"
+        )
     try:
         return base64.b64decode(body, validate=True)
     except (binascii.Error, ValueError):
-        raise PoiseError(f"the embedded buffer {index} is not valid base64", path, CUT_OFF) from None
+        raise PoiseError(
+            f"the embedded buffer {index} is not valid base64", path, CUT_OFF, code="bad-base64"
+        ) from None
 
 
 def _beside(uri: str, index: int, path: Path) -> Path:
@@ -188,22 +228,29 @@ def _beside(uri: str, index: int, path: Path) -> Path:
             f"buffer {index} lies at {shown(name)}, and Poise fetches nothing from elsewhere",
             path,
             "Save it with its buffers embedded (.glb)",
+            code="outside-folder",
         )
     folder = path.parent.resolve()
     try:
         target = (folder / name.replace("\\", "/")).resolve()
         inside, there = target.is_relative_to(folder), target.is_file()
     except (OSError, ValueError, RuntimeError):
-        raise PoiseError(f"the address of buffer {index} names no file", path) from None
+        raise PoiseError(
+            f"the address of buffer {index} names no file", path, code="address-malformed"
+        ) from None
     if not inside:
         raise PoiseError(
             f"buffer {index} names {shown(name)}, which lies outside the file's folder",
             path,
             "Put the buffer beside the file",
+            code="outside-folder",
         )
     if not there:
         raise PoiseError(
-            f"its buffer file {shown(name)} is missing", path, "Put the buffer beside the file"
+            f"its buffer file {shown(name)} is missing",
+            path,
+            "Put the buffer beside the file",
+            code="file-missing",
         )
     return target
 
@@ -216,7 +263,11 @@ _PACKED = ("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh
 def index_of(value: object, items: list[Any], what: str, file: GltfFile) -> int:
     """A checked index into one of the document's lists; `what` names the reference."""
     if type(value) is not int or not 0 <= value < len(items):
-        raise PoiseError(f"{what} refers to entry {shown(value)}, but there are {len(items)}", file.path)
+        raise PoiseError(
+            f"{what} refers to entry {shown(value)}, but there are {len(items)}",
+            file.path,
+            code="index-outside",
+        )
     return value
 
 
@@ -224,7 +275,9 @@ def _whole(value: object, what: str, file: GltfFile, low: int = 0) -> int:
     """A checked whole number that is not absurdly large; an absent one is 0."""
     value = 0 if value is None else value
     if type(value) is not int or not low <= value < 1 << 40:
-        raise PoiseError(f"{what} is {shown(value)}, no usable number", file.path)
+        raise PoiseError(
+            f"{what} is {shown(value)}, no usable number", file.path, code="number-unusable"
+        )
     return value
 
 
@@ -240,7 +293,9 @@ def read_accessor(file: GltfFile, index: object, kind: str, what: str) -> np.nda
     name = f"accessor {i} ({what})"
     stated = accessor.get("type")
     if stated != kind:
-        raise PoiseError(f"{name} must be of type {kind}, got {shown(stated)}", file.path)
+        raise PoiseError(
+            f"{name} must be of type {kind}, got {shown(stated)}", file.path, code="wrong-type"
+        )
     count = _whole(accessor.get("count"), f"the count of {name}", file, 1)
     file.spend(count)
     width = _WIDTHS[kind]
@@ -251,7 +306,7 @@ def read_accessor(file: GltfFile, index: object, kind: str, what: str) -> np.nda
     elif sparse is not None:
         out = np.zeros((count, width), dtype)
     else:
-        raise PoiseError(f"{name} has no data", file.path)
+        raise PoiseError(f"{name} has no data", file.path, code="data-missing")
     if sparse is not None:
         out = _with_sparse(file, sparse, out, name)
     # Odd kinds of NaN are told as what they are where they are used.
@@ -264,7 +319,9 @@ def read_accessor(file: GltfFile, index: object, kind: str, what: str) -> np.nda
 
 def _dtype(component: object, name: str, file: GltfFile) -> np.dtype:
     if type(component) is not int or component not in _DTYPES:
-        raise PoiseError(f"{name} has the unknown component type {shown(component)}", file.path)
+        raise PoiseError(
+            f"{name} has the unknown component type {shown(component)}", file.path, code="wrong-type"
+        )
     return np.dtype(_DTYPES[component])
 
 
@@ -281,20 +338,25 @@ def _strided(
             f"the data of {name} are compressed with {packed}",
             file.path,
             "Export the file without compression",
+            code="compressed",
         )
     data = file.buffer(index_of(v.get("buffer"), file.doc["buffers"], f"the view of {name}", file))
     start = _whole(v.get("byteOffset"), "a view's offset", file)
     length = _whole(v.get("byteLength"), "a view's length", file)
     if start + length > len(data):
         raise PoiseError(
-            f"the view of {name} ends at byte {start + length} of a buffer of {len(data)}", file.path
+            f"the view of {name} ends at byte {start + length} of a buffer of {len(data)}",
+            file.path,
+            code="data-out-of-bounds",
         )
     size = width * dtype.itemsize
     stride = _whole(v.get("byteStride"), "a view's stride", file) or size
     at = _whole(part.get("byteOffset"), f"the offset of {name}", file)
     if stride < size or at + stride * (count - 1) + size > length:
         raise PoiseError(
-            f"{name} needs {at + stride * (count - 1) + size} bytes of a view of {length}", file.path
+            f"{name} needs {at + stride * (count - 1) + size} bytes of a view of {length}",
+            file.path,
+            code="data-out-of-bounds",
         )
     return np.ndarray((count, width), dtype, data, start + at, (stride, dtype.itemsize))
 
@@ -303,16 +365,24 @@ def _with_sparse(file: GltfFile, sparse: dict[str, Any], dense: np.ndarray, name
     """The elements with those replaced that the sparse part lists."""
     indices, values = sparse.get("indices"), sparse.get("values")
     if indices is None or values is None:
-        raise PoiseError(f"the sparse part of {name} is incomplete", file.path)
+        raise PoiseError(f"the sparse part of {name} is incomplete", file.path, code="data-missing")
     count = _whole(sparse.get("count"), f"the sparse count of {name}", file, 1)
     if count > len(dense):
-        raise PoiseError(f"{name} replaces {count} of {len(dense)} elements", file.path)
+        raise PoiseError(
+            f"{name} replaces {count} of {len(dense)} elements", file.path, code="data-out-of-bounds"
+        )
     kind = _dtype(indices.get("componentType"), name, file)
     if kind.kind != "u":
-        raise PoiseError(f"the sparse indices of {name} are not unsigned integers", file.path)
+        raise PoiseError(
+            f"the sparse indices of {name} are not unsigned integers", file.path, code="wrong-type"
+        )
     where = _strided(file, indices, count, 1, kind, name)[:, 0]
     if int(where.max()) >= len(dense):
-        raise PoiseError(f"{name} replaces element {int(where.max())} of {len(dense)}", file.path)
+        raise PoiseError(
+            f"{name} replaces element {int(where.max())} of {len(dense)}",
+            file.path,
+            code="data-out-of-bounds",
+        )
     out = dense.copy()
     out[where] = _strided(file, values, count, out.shape[1], out.dtype, name)
     return out

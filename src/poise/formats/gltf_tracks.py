@@ -58,7 +58,9 @@ def read_tree(file: GltfFile) -> Tree:
     """The node tree; cycles, nodes with two parents and unusable transforms are refused."""
     nodes = file.doc["nodes"]
     if not nodes:
-        raise PoiseError("the file has no nodes, so there is nothing that could move", file.path)
+        raise PoiseError(
+            "the file has no nodes, so there is nothing that could move", file.path, code="no-joints"
+        )
     names = [_name(node.get("name"), i, file) for i, node in enumerate(nodes)]
     parents, children, tops = _links(file, names)
     moves = [
@@ -73,7 +75,9 @@ def _name(value: object, index: int, file: GltfFile) -> str:
     if value is None or value == "":
         return f"node_{index}"
     if not isinstance(value, str) or len(value) > MAX_NAME or not value.isprintable():
-        raise PoiseError(f"node {index} has the unusable name {shown(value)}", file.path)
+        raise PoiseError(
+            f"node {index} has the unusable name {shown(value)}", file.path, code="not-a-name"
+        )
     return value
 
 
@@ -85,12 +89,16 @@ def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]]
     for i, node in enumerate(nodes):
         below = node.get("children") or []
         if not isinstance(below, list):
-            raise PoiseError(f"the children of node '{names[i]}' are no list", file.path)
+            raise PoiseError(
+                f"the children of node '{names[i]}' are no list", file.path, code="not-a-list"
+            )
         children.append([])
         for value in below:
             child = index_of(value, nodes, f"a child of node '{names[i]}'", file)
             if parents[child] >= 0:
-                raise PoiseError(f"node '{names[child]}' has two parents", file.path)
+                raise PoiseError(
+                    f"node '{names[child]}' has two parents", file.path, code="second-parent"
+                )
             parents[child] = i
             children[i].append(child)
     # With one parent each, a node that no root reaches lies on a cycle or below one.
@@ -102,9 +110,15 @@ def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]]
             tops[child], depth[child] = tops[i], depth[i] + 1
     if len(reached) < len(nodes):
         lost = next(iter(set(range(len(nodes))) - set(reached)))
-        raise PoiseError(f"the nodes around '{names[lost]}' form a cycle", file.path)
+        raise PoiseError(
+            f"the nodes around '{names[lost]}' form a cycle", file.path, code="hierarchy-cycle"
+        )
     if max(depth) > MAX_DEPTH:
-        raise PoiseError(f"its nodes are nested {max(depth)} deep, more than any body's", file.path)
+        raise PoiseError(
+            f"its nodes are nested {max(depth)} deep, more than any body's",
+            file.path,
+            code="nested-too-deep",
+        )
     return parents, children, tops
 
 
@@ -118,7 +132,7 @@ def _transform(node: dict[str, Any], where: str) -> tuple[np.ndarray, np.ndarray
     turn = np.array([1.0, 0.0, 0.0, 0.0]) if turn is None else turn[[3, 0, 1, 2]]
     norm = np.linalg.norm(turn)
     if norm < 1e-3:
-        raise PoiseError("its rotation is a quaternion of no length", where)
+        raise PoiseError("its rotation is a quaternion of no length", where, code="not-a-rotation")
     return np.zeros(3) if place is None else place, turn / norm, np.ones(3) if scale is None else scale
 
 
@@ -127,9 +141,11 @@ def _vector(node: dict[str, Any], key: str, size: int, where: str) -> np.ndarray
     if value is None:
         return None
     if not isinstance(value, list) or len(value) != size:
-        raise PoiseError(f"its {key} must have {size} numbers", where)
+        raise PoiseError(f"its {key} must have {size} numbers", where, code="wrong-shape")
     if not all(type(x) in (int, float) and abs(x) <= MAX_VALUE for x in value):
-        raise PoiseError(f"its {key} holds something that is no usable number", where)
+        raise PoiseError(
+            f"its {key} holds something that is no usable number", where, code="number-unusable"
+        )
     return np.array(value, dtype=np.float64)
 
 
@@ -227,12 +243,13 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, rest: bool, note
     names = [str(a.get("name") or f"animation {i}") for i, a in enumerate(animations)]
     numbered = [f"{i} {shown(name)}" for i, name in enumerate(names)]
     if not animations and not (rest and wanted is None):
-        raise PoiseError("the file holds no animation", file.path, NO_ANIMATION)
+        raise PoiseError("the file holds no animation", file.path, NO_ANIMATION, code="no-animation")
     if wanted is not None and not (wanted in names or wanted in map(str, range(len(names)))):
         raise PoiseError(
             f"it has no animation {shown(wanted)}",
             file.path,
             f"Known, by number or name: {listed(numbered, 20)}",
+            code="unknown-take",
         )
     groups = _parts_of_one(file, tree, names)
     if wanted is not None:
@@ -244,7 +261,9 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, rest: bool, note
             notes.append(REST_POSE)
             return Take("", {}, {})
         if best.seconds < 0:
-            raise PoiseError("no animation of the file moves or turns a node", file.path)
+            raise PoiseError(
+                "no animation of the file moves or turns a node", file.path, code="nothing-moves"
+            )
     first = best.members[0]
     if len(best.members) > 1:
         notes.append(
@@ -349,14 +368,20 @@ def _take(file: GltfFile, tree: Tree, members: list[int], name: str) -> Take:
     for what, node, path, sampler in channels:
         mode = sampler.get("interpolation") or "LINEAR"
         if mode not in _MODES:
-            raise PoiseError(f"{what} has the unknown interpolation {shown(mode)}", file.path)
+            raise PoiseError(
+                f"{what} has the unknown interpolation {shown(mode)}", file.path, code="unknown-choice"
+            )
         times = _key_times(file, sampler.get("input"), what, known)
         values = read_accessor(file, sampler.get("output"), _KINDS[path], f"the values of {what}")
         _check_values(values, times, mode, path, tree.names[node], file)
         if path == "rotation":
             values = _wxyz(values, mode, times, tree.names[node], file)
         if (node, path) in tracks:
-            raise PoiseError(f"{what} moves the {path} of node '{tree.names[node]}' again", file.path)
+            raise PoiseError(
+                f"{what} moves the {path} of node '{tree.names[node]}' again",
+                file.path,
+                code="channel-repeated",
+            )
         tracks[node, path] = Track(times, values, mode)
     extras = file.doc["animations"][members[0]].get("extras")
     own = extras.get("poise") if isinstance(extras, dict) else None
@@ -370,10 +395,14 @@ def _key_times(file: GltfFile, index: object, what: str, known: dict[int, np.nda
     times = read_accessor(file, index, "SCALAR", f"the times of {what}")[:, 0]
     if not (np.abs(times) <= MAX_VALUE).all():
         key = int(np.argmin(np.abs(times) <= MAX_VALUE))
-        raise PoiseError(f"{what} has no usable time at key {key}", file.path)
+        raise PoiseError(f"{what} has no usable time at key {key}", file.path, code="times-unusable")
     if (np.diff(times) < 0).any():
         key = int(np.argmax(np.diff(times) < 0)) + 1
-        raise PoiseError(f"{what} goes back in time at key {key} ({times[key]:.4g} s)", file.path)
+        raise PoiseError(
+            f"{what} goes back in time at key {key} ({times[key]:.4g} s)",
+            file.path,
+            code="times-not-rising",
+        )
     known[int(index)] = times  # type: ignore[call-overload]
     return times
 
@@ -384,7 +413,9 @@ def _check_values(
     per_key = 3 if mode == "CUBICSPLINE" else 1
     if len(values) != per_key * len(times):
         raise PoiseError(
-            f"the {path} of node '{name}' has {len(values)} values for {len(times)} keys", file.path
+            f"the {path} of node '{name}' has {len(values)} values for {len(times)} keys",
+            file.path,
+            code="count-differs",
         )
     bad = ~(np.abs(values) <= MAX_VALUE).all(-1)
     if bad.any():
@@ -392,6 +423,7 @@ def _check_values(
         raise PoiseError(
             f"the {path} of joint '{name}' is no usable number at key {key} ({times[key]:.4g} s)",
             file.path,
+            code="number-unusable",
         )
 
 
@@ -403,7 +435,9 @@ def _wxyz(values: np.ndarray, mode: str, times: np.ndarray, name: str, file: Glt
     if norm.min() < 1e-3:
         key = int(norm.argmin())
         raise PoiseError(
-            f"the rotation of joint '{name}' has no length at key {key} ({times[key]:.4g} s)", file.path
+            f"the rotation of joint '{name}' has no length at key {key} ({times[key]:.4g} s)",
+            file.path,
+            code="not-a-rotation",
         )
     keys /= norm[:, None]
     return out

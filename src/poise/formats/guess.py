@@ -66,6 +66,7 @@ def stated_unit(height: float, unit_m: float, path: Path) -> Guess:
         path,
         f"Give another --unit METRES_PER_UNIT; {best} ({metres:.6g}) would make it "
         f"{_size(height * metres)}",
+        code="unit-implausible",
     )
 
 
@@ -91,6 +92,7 @@ def guess_unit(height: float, how: str, hint: float | None, path: Path, form: st
             f"the nearest guess, {best}, makes it {_size(size)}",
             path,
             "State the unit with --unit METRES_PER_UNIT",
+            code="unit-unknown",
         )
     told = f"The file states no unit: {best} taken, which make the person {size:.2f} m tall ({how})"
     other, metres_of_other = ranked[1]
@@ -434,6 +436,7 @@ def check_radians(angles: Mapping[str, np.ndarray], stated: str, path: Path, hin
             f"radians, which {stated}: the angles seem to be degrees",
             path,
             hint,
+            code="degrees-as-radians",
         )
 
 

@@ -83,6 +83,7 @@ def _lacking(points: Keypoints, lost: list[str], unseen: list[str]) -> PoiseErro
             f"Track {'that keypoint' if one else 'those keypoints'} again, or fill "
             f"{'it' if one else 'them'} in where the file was made: the body needs both hips, knees, "
             "ankles, shoulders, elbows and wrists",
+            code="keypoints-unseen",
         )
     side, part = lost[0].split("_")
     wanted = (
@@ -96,7 +97,9 @@ def _lacking(points: Keypoints, lost: list[str], unseen: list[str]) -> PoiseErro
     hint = f"Did you mean '{guess}'? " if guess else ""
     hint += f"The keypoints are {listed(points.names, 12)}; labels like "
     hint += f"{listed(known_labels(), 6)} or the joint names of BVH, SMPL and COCO are understood"
-    return PoiseError(f"no keypoint is the {places}", points.source.path or points.name, hint)
+    return PoiseError(
+        f"no keypoint is the {places}", points.source.path or points.name, hint, code="keypoint-missing"
+    )
 
 
 def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float | None) -> Landmarks:
@@ -128,6 +131,7 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         raise PoiseError(
             f"no two frames in a row have all needed keypoints (the {worst} is missing most often)",
             points.source.path or points.name,
+            code="keypoints-unseen",
         )
     if stop - start < points.frames:
         notes.append(

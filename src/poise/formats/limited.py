@@ -48,7 +48,12 @@ def read_limited(
     # -P: a module that lies beside the user's files is never imported.
     command = [sys.executable, "-P", str(_SCRIPT), str(script), str(path.resolve())]
     command += [str(seconds), str(memory), json.dumps(options)]
-    slow = PoiseError(f"the {kind} could not be read in {seconds:.0f} s", path, "It seems damaged")
+    slow = PoiseError(
+        f"the {kind} could not be read in {seconds:.0f} s",
+        path,
+        "It seems damaged",
+        code="reading-too-slow",
+    )
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
@@ -57,7 +62,9 @@ def read_limited(
     except subprocess.TimeoutExpired:
         raise slow from None
     except OSError as error:
-        raise PoiseError(f"no process could be started to read it ({error.strerror})", path) from None
+        raise PoiseError(
+            f"no process could be started to read it ({error.strerror})", path, code="no-process"
+        ) from None
     if done.returncode == 0:
         try:
             with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
@@ -67,13 +74,17 @@ def read_limited(
     if done.returncode == -getattr(signal, "SIGXCPU", 24):
         raise slow
     if done.returncode == MEMORY:
-        raise PoiseError(f"the {kind} takes more than {memory / 1e9:.1f} GB to read", path, hint)
+        raise PoiseError(
+            f"the {kind} takes more than {memory / 1e9:.1f} GB to read", path, hint, code="out-of-memory"
+        )
     said = _said(done.stdout) if done.returncode in (REFUSED, FAULT) else {}
     if done.returncode == REFUSED and said:
-        raise PoiseError(str(said.get("what")), path, said.get("hint"))
+        raise PoiseError(
+            str(said.get("what")), path, said.get("hint"), code=str(said.get("code") or "file-damaged")
+        )
     crashed = "what reads it crashed" if done.returncode < 0 else f"reading ended with {done.returncode}"
     reason = shown(what) if (what := " ".join(str(said.get("what") or "").split())) else crashed
-    raise PoiseError(f"the {kind} is damaged ({reason})", path, hint)
+    raise PoiseError(f"the {kind} is damaged ({reason})", path, hint, code="file-damaged")
 
 
 def _said(answer: bytes) -> dict[str, Any]:

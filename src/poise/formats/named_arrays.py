@@ -127,10 +127,20 @@ def read_kimodo(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Cl
     pos = numeric(data, "posed_joints", (None, None, 3), path)
     count = pos.shape[1]
     if count == ROBOT:
-        raise PoiseError("it is the motion of a robot (G1)", path, "Give a motion of SOMA or SMPL-X")
+        raise PoiseError(
+            "it is the motion of a robot (G1)",
+            path,
+            "Give a motion of SOMA or SMPL-X",
+            code="robot-motion",
+        )
     if count not in SKELETONS:
         known = ", ".join(str(n) for n in sorted(SKELETONS))
-        raise PoiseError(f"a motion of Kimodo with {count} joints is not known", path, f"Known: {known}")
+        raise PoiseError(
+            f"a motion of Kimodo with {count} joints is not known",
+            path,
+            f"Known: {known}",
+            code="layout-unknown",
+        )
     names, parents = SKELETONS[count]
     turns = numeric(data, "global_rot_mats", (len(pos), count, 3, 3), path)
     refuse_bad(pos, "the place", path, names)
@@ -186,17 +196,21 @@ def read_poselib(data: Mapping[str, Any], path: Path, options: ReadOptions) -> C
     )
     tree = data["skeleton_tree"]
     if not isinstance(tree, dict):
-        raise PoiseError("its skeleton_tree is no dict", path)
+        raise PoiseError("its skeleton_tree is no dict", path, code="wrong-type")
     require(tree, ("node_names", "parent_indices", "local_translation"), path, "its skeleton_tree")
     names = tree["node_names"]
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-        raise PoiseError("its node_names are no list of texts", path)
+        raise PoiseError("its node_names are no list of texts", path, code="wrong-type")
     if not 0 < len(names) <= MAX_JOINTS:
-        raise PoiseError(f"it has {len(names)} joints; 1 to {MAX_JOINTS} are allowed", path)
+        raise PoiseError(
+            f"it has {len(names)} joints; 1 to {MAX_JOINTS} are allowed", path, code="joint-count"
+        )
     count = len(names)
     parents = tuple(int(p) for p in _inner(tree, "parent_indices", (count,), path))
     if any((p < 0) != (j == 0) or p >= j for j, p in enumerate(parents)):
-        raise PoiseError("its parent_indices do not put parents before children", path)
+        raise PoiseError(
+            "its parent_indices do not put parents before children", path, code="parent-order"
+        )
     offsets = _inner(tree, "local_translation", (count, 3), path)
     refuse_bad(offsets[None], "the rest place", path, names)
     xyzw = _inner(data, "rotation", (None, count, 4), path)
@@ -243,6 +257,7 @@ def _local(
         raise PoiseError(
             f"the quaternion of joint '{names[joint]}' has length {norm[frame, joint]:.3g}, no rotation",
             f"{path}, frame {frame}",
+            code="not-a-rotation",
         )
     quat = torch.tensor(np.roll(xyzw, 1, axis=-1))
     if is_local:
@@ -307,7 +322,7 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
             if not header.dtype.hasobject:
                 refuse_array(header.shape, path)
     if not options.allow_pickle:
-        raise PoiseError("this is a pickled file", path, ASK)
+        raise PoiseError("this is a pickled file", path, ASK, code="pickle-refused")
     value, note = one_of_dicts(load_plain(path), _is_known, options.take, path)
     clip = _read(named_arrays(value, path), path, replace(options, take=None) if note else options)
     source = clip.skeleton.source
@@ -324,7 +339,12 @@ def _read(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
             return with_labels(kind.read(data, path, options), data)
     there = listed((shown(k) for k in data), 4) if len(data) else "none at all"
     known = "; ".join(kind.name for kind in KINDS[:-1])
-    raise PoiseError(f"its arrays are no motion that is known ({there})", path, f"Known: {known}")
+    raise PoiseError(
+        f"its arrays are no motion that is known ({there})",
+        path,
+        f"Known: {known}",
+        code="layout-unknown",
+    )
 
 
 def write_npz(clip: Clip, path: Path) -> None:

@@ -93,12 +93,12 @@ def turn_and_scale(
     """
     scale = np.linalg.norm(axes, axis=-2)
     if scale.min() < 1e-9:
-        raise PoiseError(f"its {what} flattens space", where)
+        raise PoiseError(f"its {what} flattens space", where, code="scale-unusable")
     turn = axes / scale[..., None, :]
     if np.linalg.det(turn).min() < 0:
-        raise PoiseError(f"its {what} mirrors space, which a body cannot do", where)
+        raise PoiseError(f"its {what} mirrors space, which a body cannot do", where, code="mirrored")
     if np.abs(np.swapaxes(turn, -1, -2) @ turn - np.eye(3)).max() > _SHEAR:
-        raise PoiseError(f"its {what} shears space", where, hint)
+        raise PoiseError(f"its {what} shears space", where, hint, code="sheared")
     return matrix_to_quat(torch.tensor(turn)).numpy(), scale
 
 

@@ -93,7 +93,7 @@ def read_mot(path: Path, options: ReadOptions) -> Clip:
     lines = read_bytes(path).splitlines()
     end = next((i for i, line in enumerate(lines) if line.strip().lower() == b"endheader"), len(lines))
     if end + 1 >= len(lines):
-        raise PoiseError("the file ends in its header", path, CUT_OFF)
+        raise PoiseError("the file ends in its header", path, CUT_OFF, code="file-cut-off")
     degrees = any(x.strip().lower().replace(b" ", b"") == b"indegrees=yes" for x in lines[:end])
     names = decode(lines[end + 1], path, end + 2).split()
     table = number_table(lines, end + 2, len(names), path)
@@ -101,11 +101,15 @@ def read_mot(path: Path, options: ReadOptions) -> Clip:
     require(columns, ("time", *_PELVIS), path, "this OpenSim motion")
     check_frames(len(table), path)
     if not (np.abs(columns["time"]) <= MAX_VALUE).all():
-        raise PoiseError("its times are no usable numbers", path, "Write them as seconds")
+        raise PoiseError(
+            "its times are no usable numbers", path, "Write them as seconds", code="times-unusable"
+        )
     steps = np.diff(columns["time"])
     step = float(steps.mean())
     if not (step > 0 and np.abs(steps / step - 1).max() < 0.05):
-        raise PoiseError("its times are not evenly spaced", path, "Resample it in OpenSim")
+        raise PoiseError(
+            "its times are not evenly spaced", path, "Resample it in OpenSim", code="times-uneven"
+        )
     turns = {k: columns[k] for k in _coordinates() if k in columns}
     _check_unit(turns, degrees, path)
     for name in turns:
@@ -159,6 +163,7 @@ def _check_unit(turns: Mapping[str, np.ndarray], degrees: bool, path: Path) -> N
             "unit that inDegrees=yes in the header states: the angles seem to be radians",
             path,
             "Write inDegrees=no in the header, or convert the table",
+            code="radians-as-degrees",
         )
 
 
@@ -188,7 +193,7 @@ def _rate(
     if fps > 0:
         notes.append(f"The frame rate, {fps:g} frames per second, follows from the velocities")
         return fps
-    raise PoiseError("the file states no frame rate", path, "State it with --fps F")
+    raise PoiseError("the file states no frame rate", path, "State it with --fps F", code="rate-missing")
 
 
 def _clip(
@@ -196,7 +201,11 @@ def _clip(
 ) -> Clip:
     frames = {len(v) for v in turns.values()}
     if len(frames) != 1:
-        raise PoiseError(f"its coordinates have different lengths: {listed(sorted(frames))}", path)
+        raise PoiseError(
+            f"its coordinates have different lengths: {listed(sorted(frames))}",
+            path,
+            code="length-differs",
+        )
     for name, values in turns.items():
         refuse_bad(values, f"coordinate {shown(name)}", path)
     rows = [

@@ -61,7 +61,10 @@ def source_from_json(text: str, path: Path) -> Source:
         return replace(source, notes=tuple(cut), mended=tuple(mended))
     except (KeyError, TypeError, ValueError) as error:
         raise PoiseError(
-            f"the record of the clip's source is damaged ({shown(error)})", path, CUT_OFF
+            f"the record of the clip's source is damaged ({shown(error)})",
+            path,
+            CUT_OFF,
+            code="file-damaged",
         ) from None
 
 
@@ -95,7 +98,9 @@ def loads(text: str, path: Path, what: str) -> dict[str, Any]:
         if not isinstance(record, dict):
             raise ValueError("it is no JSON object")
     except (ValueError, RecursionError) as error:
-        raise PoiseError(f"the {what} record is damaged ({shown(error)})", path, CUT_OFF) from None
+        raise PoiseError(
+            f"the {what} record is damaged ({shown(error)})", path, CUT_OFF, code="file-damaged"
+        ) from None
     return record
 
 
@@ -114,25 +119,33 @@ def make_skeleton(
     """
     count = len(names)
     if not 0 < count <= MAX_JOINTS:
-        raise PoiseError(f"it has {count} joints; 1 to {MAX_JOINTS} are allowed", path)
+        raise PoiseError(
+            f"it has {count} joints; 1 to {MAX_JOINTS} are allowed", path, code="joint-count"
+        )
     if len(parents) != count or len(offsets) != count or len(end_joints) != len(ends):
         raise PoiseError(
             f"{count} names, {len(parents)} parents, {len(offsets)} offsets, {len(end_joints)} end "
             f"joints and {len(ends)} ends do not fit together",
             path,
+            code="count-differs",
         )
     for what, table in (("offsets", offsets), ("ends", ends)):
         if not (np.abs(table) <= MAX_VALUE).all():
-            raise PoiseError(f"array '{what}' holds a number that is not usable", path)
+            raise PoiseError(
+                f"array '{what}' holds a number that is not usable", path, code="number-unusable"
+            )
     if count > 1 and not np.abs(offsets[1:]).max() >= LEAST_BONE_M:
-        raise PoiseError("no bone of the skeleton has any length", path)
+        raise PoiseError("no bone of the skeleton has any length", path, code="skeleton-without-length")
     if not ((end_joints >= 0) & (end_joints < count)).all():
-        raise PoiseError("array 'end_joints' names a joint that does not exist", path)
+        raise PoiseError(
+            "array 'end_joints' names a joint that does not exist", path, code="index-outside"
+        )
     tips = tuple((int(j), triple(e)) for j, e in zip(end_joints, ends.tolist(), strict=True))
     if source.travel_joint is not None and source.travel_joint not in names:
         raise PoiseError(
             f"there is no joint '{source.travel_joint}'. {did_you_mean(source.travel_joint, names)}",
             path,
+            code="unknown-joint",
         )
     return Skeleton(tuple(names), tuple(int(p) for p in parents), offsets, tips, source)
 
@@ -141,7 +154,11 @@ def refuse_overrides(options: ReadOptions, path: Path) -> None:
     """Unit and vertical are stated in Poise's own files, so nothing may override them."""
     for flag, value in (("--unit", options.unit_m), ("--up", options.up_axis)):
         if value is not None:
-            raise PoiseError(f"{flag} is not for Poise's own files, which are in metres, Z up", path)
+            raise PoiseError(
+                f"{flag} is not for Poise's own files, which are in metres, Z up",
+                path,
+                code="option-not-applicable",
+            )
 
 
 CSV_VERSION = 1
@@ -247,24 +264,31 @@ def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
             f"it is no table of keypoints and no CSV of Poise, which begins with '{CSV_MARK} {VERSION}'",
             path,
             "Name the columns of keypoints NAME_x, NAME_y, NAME_z",
+            code="wrong-format",
         )
     version = first.removeprefix(CSV_MARK).strip(" ,\t")
     if version != str(CSV_VERSION):
         raise PoiseError(
             f"the file has version {shown(version)} of Poise's CSV; this Poise reads version {VERSION}",
             at_line(path, 1),
+            code="version-unsupported",
         )
     header: dict[str, str] = {}
     for i, line in enumerate(lines):
         if not line.startswith(b"#"):
             missing = [k for k in ("name", "fps", "cyclic", "skeleton", "source") if k not in header]
             if missing:
-                raise PoiseError(f"the line '# {missing[0]}:' is missing", path, "Keep the lines with #")
+                raise PoiseError(
+                    f"the line '# {missing[0]}:' is missing",
+                    path,
+                    "Keep the lines with #",
+                    code="part-missing",
+                )
             return header, i
         key, colon, value = decode(line, path, i + 1)[1:].partition(":")
         if colon:
             header[key.strip()] = value.strip()
-    raise PoiseError("the file ends before the column names", path, CUT_OFF)
+    raise PoiseError("the file ends before the column names", path, CUT_OFF, code="file-cut-off")
 
 
 def _skeleton(header: dict[str, str], path: Path) -> Skeleton:
@@ -276,10 +300,16 @@ def _skeleton(header: dict[str, str], path: Path) -> Skeleton:
         offsets = np.array(record["offsets"], dtype=np.float64).reshape(-1, 3)
         ends = np.array(record["ends"], dtype=np.float64).reshape(-1, 4)
     except (TypeError, ValueError, OverflowError) as error:
-        raise PoiseError(f"the skeleton record is damaged ({shown(error)})", path, CUT_OFF) from None
+        raise PoiseError(
+            f"the skeleton record is damaged ({shown(error)})", path, CUT_OFF, code="file-damaged"
+        ) from None
     source = source_from_json(header["source"], path)
     if not (np.isfinite(ends).all() and (np.abs(ends[:, 0]) <= MAX_JOINTS).all()):
-        raise PoiseError("the skeleton record holds an end that is not finite or on no joint", path)
+        raise PoiseError(
+            "the skeleton record holds an end that is not finite or on no joint",
+            path,
+            code="number-unusable",
+        )
     return make_skeleton(names, parents, offsets, ends[:, 0].astype(int), ends[:, 1:], source, path)
 
 
@@ -291,7 +321,12 @@ def _order(lines: list[bytes], first: int, skeleton: Skeleton, path: Path) -> li
     order = []
     for name in columns(skeleton):
         if name.strip() not in at:
-            raise PoiseError(f"the column '{name}' is missing", place, did_you_mean(name, found))
+            raise PoiseError(
+                f"the column '{name}' is missing",
+                place,
+                did_you_mean(name, found),
+                code="column-missing",
+            )
         order.append(at[name.strip()])
     return [len(found), *order]
 
@@ -301,7 +336,7 @@ def _table(lines: list[bytes], first: int, order: list[int], path: Path) -> np.n
     width, *at = order
     rows = [line for line in lines[first + 1 :] if line.strip(BLANK)]
     if not rows:
-        raise PoiseError("the file has no frames", path, CUT_OFF)
+        raise PoiseError("the file has no frames", path, CUT_OFF, code="no-frames")
     try:
         table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
     except ValueError:
@@ -320,7 +355,7 @@ def _check_times(times: np.ndarray, fps: float, path: Path) -> None:
         frame = int(np.flatnonzero(off)[0]) + 1
         raise PoiseError(
             f"frame {frame} is {times[frame] - times[frame - 1]:.6g} s after the one before it, not "
-            f"{1.0 / fps:.6g} s", path, "Keep one row per frame",
+            f"{1.0 / fps:.6g} s", path, "Keep one row per frame", code="times-uneven",
         )  # fmt: skip
 
 
@@ -375,12 +410,13 @@ def read_poise_npz(data: Mapping[str, Any], path: Path, options: ReadOptions) ->
             f"the file has version {version} of Poise's clip format; this Poise reads up to {VERSION}",
             path,
             "Install a newer Poise",
+            code="version-unsupported",
         )
     require(data, _KEYS, path, "this file of Poise")
     refuse_overrides(options, path)
     names = np.asarray(data["names"])
     if names.dtype.kind != "U" or names.ndim != 1:
-        raise PoiseError("array 'names' must hold one text per joint", path)
+        raise PoiseError("array 'names' must hold one text per joint", path, code="wrong-type")
     labels = [str(n) for n in names]
     root_pos = numeric(data, "root_pos", (None, 3), path)
     rot = numeric(data, "rot", (len(root_pos), len(labels), 4), path)
@@ -406,7 +442,7 @@ def _joints(data: Mapping[str, Any], key: str, path: Path) -> np.ndarray:
     """Indices of joints."""
     value = numeric(data, key, (None,), path)
     if not (np.abs(value) <= MAX_JOINTS).all():
-        raise PoiseError(f"array '{key}' holds a number that is no joint's", path)
+        raise PoiseError(f"array '{key}' holds a number that is no joint's", path, code="index-outside")
     return value.astype(int)
 
 
@@ -441,7 +477,7 @@ def unpack_clips(tensors: Mapping[str, Tensor], notes: Sequence[Mapping[str, Any
     try:
         return [_clip(tensors, note, i) for i, note in enumerate(notes)]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as problem:
-        raise PoiseError(f"the packed clips are incomplete: {problem}") from None
+        raise PoiseError(f"the packed clips are incomplete: {problem}", code="file-damaged") from None
 
 
 def _clip(tensors: Mapping[str, Tensor], note: Mapping[str, Any], i: int) -> Clip:

@@ -69,6 +69,7 @@ def chosen(people: Sequence[str], take: str | None, path: Path) -> tuple[str, li
                 f"it holds {len(people)} people, and none is called {shown(take)}",
                 path,
                 f"{did_you_mean(take, list(people))}, or give a number from 0",
+                code="unknown-take",
             )
     if len(people) == 1:
         return one, []
@@ -119,7 +120,7 @@ def one_person(
     axis = 0 if table.shape[0] < table.shape[1] else 1
     names = [str(k) for k in range(table.shape[axis])]
     if not names:
-        raise PoiseError("its axis of people is empty", path)
+        raise PoiseError("its axis of people is empty", path, code="no-people")
     one, note = chosen(names, take, path)
     return np.take(table, int(one), axis=axis), note
 

@@ -152,7 +152,9 @@ def load_plain(path: str | Path) -> Any:
         file = io.BytesIO(data)
         header = npy_header(file, path)
         if not header.dtype.hasobject:
-            raise PoiseError("the file holds one array of numbers, not a dict of arrays", path)
+            raise PoiseError(
+                "the file holds one array of numbers, not a dict of arrays", path, code="wrong-type"
+            )
         data = data[file.tell() :]
     return loads_restricted(data, path)
 
@@ -162,7 +164,11 @@ def named_arrays(value: Any, path: Path) -> dict[str, Any]:
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
-        raise PoiseError(f"the pickle holds a {type(value).__name__}, not a dict of named arrays", path)
+        raise PoiseError(
+            f"the pickle holds a {type(value).__name__}, not a dict of named arrays",
+            path,
+            code="wrong-type",
+        )
     return value
 
 
@@ -171,9 +177,11 @@ def loads_restricted(data: bytes, where: str | Path) -> Any:
     try:
         return _plain(_Machine(data, where).load(), {}, 0)
     except _DAMAGE as error:
-        raise PoiseError(f"the pickle is damaged ({shown(error)})", where, CUT_OFF) from None
+        raise PoiseError(
+            f"the pickle is damaged ({shown(error)})", where, CUT_OFF, code="file-damaged"
+        ) from None
     except RecursionError:
-        raise PoiseError("the pickle is nested too deeply", where) from None
+        raise PoiseError("the pickle is nested too deeply", where, code="nested-too-deep") from None
 
 
 @dataclass(frozen=True)
@@ -196,10 +204,16 @@ class _Machine(_Library):
         """The step of an instruction, where `load` looks for it."""
         self.steps += 1
         if self.steps > _MAX_STEPS:
-            raise PoiseError(f"the pickle has more than {_MAX_STEPS} instructions", self.where)
+            raise PoiseError(
+                f"the pickle has more than {_MAX_STEPS} instructions", self.where, code="over-limit"
+            )
         name = _NAMES.get(code, "an unknown instruction")
         if name not in _STEPS:
-            raise PoiseError(f"the pickle uses {name}, which plain data does not need", self.where)
+            raise PoiseError(
+                f"the pickle uses {name}, which plain data does not need",
+                self.where,
+                code="pickle-refused",
+            )
         return _STEPS[name]
 
     def find_class(self, module: str, name: str) -> _Named:
@@ -211,6 +225,7 @@ class _Machine(_Library):
                 f"the pickle names {shown(named)}, which is no plain data, and was not read",
                 self.where,
                 "Save the arrays with numpy.savez instead",
+                code="pickle-refused",
             )
         return _Named(named)
 
@@ -220,7 +235,9 @@ class _Machine(_Library):
         self.made += inner.nbytes if isinstance(inner, np.ndarray) else 0
         self.made += len(inner) if isinstance(inner, bytes) else 0
         if self.made > 2 * MAX_ARRAY_BYTES:
-            raise PoiseError("the pickle holds more arrays than the limit", self.where)
+            raise PoiseError(
+                "the pickle holds more arrays than the limit", self.where, code="over-limit"
+            )
         return value
 
     def reduce(self) -> None:

@@ -53,7 +53,12 @@ def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED)
     fps, notes = options.fps, people
     if fps is None:
         if len(names) != len(HUMANML3D):
-            raise PoiseError("an array of joints states no frame rate", path, "State it with --fps F")
+            raise PoiseError(
+                "an array of joints states no frame rate",
+                path,
+                "State it with --fps F",
+                code="rate-missing",
+            )
         fps = _HUMANML3D_FPS
         notes.append("The file states no frame rate: 20 taken, as HumanML3D has it (--fps F)")
     positions = numeric({"joints": array}, "joints", (None, len(names), 3), path)
@@ -89,7 +94,7 @@ def named_joint_points(
     if not is_joints(joints.shape, joints.dtype):
         raise PoiseError(
             f"its array 'joints' has the shape {joints.shape}", path,
-            "Joints of SMPL are (T, 22, 3) or (T, 24, 3); others need names (J)",
+            "Joints of SMPL are (T, 22, 3) or (T, 24, 3); others need names (J)", code="wrong-shape",
         )  # fmt: skip
     fps = one_number(data, "fps", path) if options.fps is None else options.fps
     check_rate(fps, path)
@@ -112,26 +117,37 @@ def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNS
     require(data, ("positions", "names"), path, "a keypoint file")
     positions = np.asarray(data["positions"])
     if positions.ndim == 3 and positions.shape[-1] == 2:
-        raise PoiseError(f"its positions have the shape {positions.shape}: they are 2D", path, FLAT_HINT)
+        raise PoiseError(
+            f"its positions have the shape {positions.shape}: they are 2D",
+            path,
+            FLAT_HINT,
+            code="flat-keypoints",
+        )
     table, notes = one_person(positions, 3, options.take, path)
     positions = numeric({"positions": table}, "positions", (None, None, 3), path)
     names = tuple(text_of(x).strip() for x in np.ravel(np.asarray(data["names"])))
     if len(names) != positions.shape[1] or not all(names) or len(names) > MAX_JOINTS:
         raise PoiseError(
-            f"it has {len(names)} names and {positions.shape[1]} keypoints; each needs a name", path
+            f"it has {len(names)} names and {positions.shape[1]} keypoints; each needs a name",
+            path,
+            code="count-differs",
         )
     fps = options.fps
     if fps is None:
         if "fps" not in data:
-            raise PoiseError("the arrays state no frame rate", path, "Add fps, or give --fps F")
+            raise PoiseError(
+                "the arrays state no frame rate", path, "Add fps, or give --fps F", code="rate-missing"
+            )
         fps = one_number(data, "fps", path)
         check_rate(fps, path)
     unit = one_number(data, "unit_m", path) if "unit_m" in data else None
     up = text_of(data["up_axis"]).upper() if "up_axis" in data else None
     if unit is not None and not unit > 0:
-        raise PoiseError(f"unit_m must be above 0, got {unit:g}", path)
+        raise PoiseError(f"unit_m must be above 0, got {unit:g}", path, code="out-of-range")
     if up not in (None, *UPS):
-        raise PoiseError(f"up_axis must be one of {', '.join(UPS)}, got {shown(up or '')}", path)
+        raise PoiseError(
+            f"up_axis must be one of {', '.join(UPS)}, got {shown(up or '')}", path, code="unknown-axis"
+        )
     scores = None
     if "confidence" in data:
         own, _ = one_person(np.asarray(data["confidence"]), 2, options.take, path)
@@ -151,15 +167,23 @@ def mdm_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNSTA
     """
     take = options.take or "0"
     if not take.isdecimal():
-        raise PoiseError(f"--take must be the number of a motion, got {shown(take)}", path)
+        raise PoiseError(
+            f"--take must be the number of a motion, got {shown(take)}", path, code="option-malformed"
+        )
     index = int(take)
     motion = numeric(data, "motion", (None, len(HUMANML3D), 3, None), path)
     lengths = numeric(data, "lengths", (len(motion),), path)
     if index >= len(motion):
-        raise PoiseError(f"it holds {len(motion)} motions, there is none with index {index}", path)
+        raise PoiseError(
+            f"it holds {len(motion)} motions, there is none with index {index}",
+            path,
+            code="unknown-take",
+        )
     length = lengths[index]
     if not 1 <= length <= motion.shape[-1]:
-        raise PoiseError(f"motion {index} states {length:g} of {motion.shape[-1]} frames", path)
+        raise PoiseError(
+            f"motion {index} states {length:g} of {motion.shape[-1]} frames", path, code="length-differs"
+        )
     notes = []
     if len(motion) > 1:
         notes.append(f"The file holds {len(motion)} motions: number {index} was read (--take N)")
@@ -208,6 +232,7 @@ def feature_points(table: np.ndarray, path: Path, options: ReadOptions = UNSTATE
             f"its array of shape {table.shape} holds the features of HumanML3D, but normalised or empty",
             path,
             "Give features * Std.npy + Mean.npy, or the joints recovered from them, (T, 22, 3)",
+            code="features-normalised",
         )
     turn = 2.0 * np.concatenate(([0.0], np.cumsum(x[:-1, 0])))
     steps = np.zeros((len(x), 3))

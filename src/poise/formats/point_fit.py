@@ -41,9 +41,9 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.max_gap_s) and self.max_gap_s >= 0):
-            raise PoiseError(f"max_gap_s must be at least 0, got {self.max_gap_s}")
+            raise PoiseError(f"max_gap_s must be at least 0, got {self.max_gap_s}", code="out-of-range")
         if self.smooth_hz is not None and not (np.isfinite(self.smooth_hz) and self.smooth_hz > 0):
-            raise PoiseError(f"smooth_hz must be above 0, got {self.smooth_hz}")
+            raise PoiseError(f"smooth_hz must be above 0, got {self.smooth_hz}", code="out-of-range")
 
 
 def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
@@ -62,11 +62,15 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     notes = list(marks.notes)
     tracks, spine = trunk_tracks({p: torch.tensor(t) for p, t in marks.tracks.items()}, notes)
     if not _span(tracks) > 1e-6:
-        raise PoiseError("all keypoints lie in one place", points.source.path or points.name)
+        raise PoiseError(
+            "all keypoints lie in one place",
+            points.source.path or points.name,
+            code="points-in-one-place",
+        )
     rest = measure(tracks, spine, notes)
     if bad := next((n for n, offset in rest.offsets.items() if not np.isfinite(offset).all()), None):
         what = f"its keypoints give the bone to '{bad}' no length that is a number"
-        raise PoiseError(what, points.source.path or points.name)
+        raise PoiseError(what, points.source.path or points.name, code="zero-length-bone")
     tracks = hold_lengths(tracks, bones_of(rest))
     root_pos, rot = Solver(rest, tracks, points.fps).run()
     names = tuple(rest.parents)
@@ -93,7 +97,11 @@ def fit_distances(points: Keypoints, clip: Clip) -> dict[str, np.ndarray]:
     """Joint -> `(T,)` m from the fitted joint to the keypoint it follows, NaN where missing."""
     tracks, _ = places_of(points)
     if points.frames != clip.frames:
-        raise PoiseError(f"{points.frames} frames of keypoints and {clip.frames} of the clip", clip.name)
+        raise PoiseError(
+            f"{points.frames} frames of keypoints and {clip.frames} of the clip",
+            clip.name,
+            code="length-differs",
+        )
     pos = clip.positions()
     return {
         joint: np.linalg.norm(pos[:, clip.skeleton.index(joint)] - tracks[place], axis=-1)

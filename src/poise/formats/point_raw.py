@@ -183,31 +183,40 @@ def _check(raw: RawPoints) -> None:
     frames = len(raw.positions)
     if len(raw.names) > MAX_JOINTS:
         raise PoiseError(
-            f"it has {len(raw.names)} keypoints, more than the {MAX_JOINTS} allowed", raw.path
+            f"it has {len(raw.names)} keypoints, more than the {MAX_JOINTS} allowed",
+            raw.path,
+            code="too-many-joints",
         )
     longest = max(raw.names, key=len, default="")
     if len(longest) > MAX_NAME:
         raise PoiseError(
-            f"the keypoint {shown(longest)} has a name of {len(longest)} characters", raw.path
+            f"the keypoint {shown(longest)} has a name of {len(longest)} characters",
+            raw.path,
+            code="over-limit",
         )
     if frames < 2:
         raise PoiseError(
-            f"it has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2", raw.path
+            f"it has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2",
+            raw.path,
+            code="clip-too-short",
         )
     check_poses(frames, len(raw.names), raw.path)
     known = raw.positions[~np.isnan(raw.positions).any(-1)]
     if not len(known):
-        raise PoiseError("every keypoint is missing in every frame", raw.path)
+        raise PoiseError("every keypoint is missing in every frame", raw.path, code="keypoints-unseen")
     if np.abs(known).max() > MAX_VALUE:
-        raise PoiseError(f"it holds coordinates above {MAX_VALUE:g}, no place of a person", raw.path)
+        raise PoiseError(
+            f"it holds coordinates above {MAX_VALUE:g}, no place of a person", raw.path, code="too-far"
+        )
     flat = [c for c, width in zip("XYZ", np.ptp(known, axis=0), strict=True) if width == 0]
     if len(flat) == 3:
-        raise PoiseError("all keypoints lie in one place", raw.path)
+        raise PoiseError("all keypoints lie in one place", raw.path, code="points-in-one-place")
     if flat:
         raise PoiseError(
             f"the keypoints are flat: {' and '.join(flat)} never changes, as in the 2D of a camera",
             raw.path,
             FLAT_HINT,
+            code="flat-keypoints",
         )
 
 
@@ -234,6 +243,7 @@ def _body(points: Keypoints) -> _Body:
         raise PoiseError(
             "in no frame are all hips, knees, ankles, shoulders, elbows and wrists seen",
             points.source.path,
+            code="keypoints-unseen",
         )
     after = later_frames(frames, points.fps, len(seen))
     # Frames with a later one tell what stands still; without any, each is its own later one.
@@ -270,7 +280,7 @@ def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
 def _unit(body: _Body, options: ReadOptions, raw: RawPoints) -> Guess:
     height, how = body_height(body.names, body.parents, _offsets(body.parents, body.pos), body.pos)
     if not height > 0:
-        raise PoiseError("all keypoints lie in one place", raw.path)
+        raise PoiseError("all keypoints lie in one place", raw.path, code="points-in-one-place")
     # A stated unit that makes a giant or a doll is a mistake, the file's too; the sentence tells.
     stated = raw.unit_m if options.unit_m is None else options.unit_m
     if stated is not None:

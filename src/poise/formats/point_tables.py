@@ -58,7 +58,7 @@ def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
         stated.update(re.findall(r"\b(\w{1,30})\s*[=:]\s*([^\s,;]+)", lines[at].lower()))
         at += 1
     if at == len(lines):
-        raise PoiseError("the table has no header", path, CUT_OFF)
+        raise PoiseError("the table has no header", path, CUT_OFF, code="file-cut-off")
     # The header tells what stands between cells; rows may hold decimal commas as well.
     mark = _mark(lines[at])
     layout = _layout(_split(lines[at], mark), path, at + 1)
@@ -73,9 +73,16 @@ def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
                 scores[:, k] = np.nan_to_num(table[:, layout.scores[name]])
     unit, up = stated.get("unit"), stated.get("up", "").upper()
     if unit is not None and unit not in UNITS_M:
-        raise PoiseError(f"the unit {shown(unit)} is not known", path, f"Known: {', '.join(UNITS_M)}")
+        raise PoiseError(
+            f"the unit {shown(unit)} is not known",
+            path,
+            f"Known: {', '.join(UNITS_M)}",
+            code="unit-unknown",
+        )
     if up not in ("", *UPS):
-        raise PoiseError(f"up must be one of {', '.join(UPS)}, got {shown(up)}", path)
+        raise PoiseError(
+            f"up must be one of {', '.join(UPS)}, got {shown(up)}", path, code="unknown-axis"
+        )
     return RawPoints(
         "csv", path, tuple(layout.points), positions, rate, UNITS_M.get(unit or ""), up or None, scores
     )
@@ -103,7 +110,7 @@ def _layout(header: list[str], path: Path, line: int) -> _Layout:
         elif match := _COLUMN.match(cell):
             name, axis = match.group(1), match.group(2).lower()
             if axis in axes.setdefault(name, {}):
-                raise PoiseError(f"the column {shown(cell)} appears twice", where)
+                raise PoiseError(f"the column {shown(cell)} appears twice", where, code="name-repeated")
             axes[name][axis] = k
         elif match := _SCORE.match(cell):
             scores[match.group(1)] = k
@@ -112,15 +119,20 @@ def _layout(header: list[str], path: Path, line: int) -> _Layout:
     whole = {n: (a["x"], a["y"], a["z"]) for n, a in axes.items() if len(a) == 3}
     broken = [n for n in axes if n not in whole]
     if axes and all(set(axes[n]) == {"x", "y"} for n in axes):
-        raise PoiseError("its keypoints have x and y and no z: they are 2D", where, FLAT_HINT)
+        raise PoiseError(
+            "its keypoints have x and y and no z: they are 2D", where, FLAT_HINT, code="flat-keypoints"
+        )
     if broken:
         lacks = ", ".join(a for a in "xyz" if a not in axes[broken[0]])
-        raise PoiseError(f"keypoint {shown(broken[0])} has no column for {lacks}", where)
+        raise PoiseError(
+            f"keypoint {shown(broken[0])} has no column for {lacks}", where, code="column-missing"
+        )
     if not whole:
         raise PoiseError(
             f"the header names no keypoint (columns: {listed(map(shown, other))})",
             where,
             "Name the columns NAME_x, NAME_y, NAME_z",
+            code="no-keypoints",
         )
     return _Layout(header, whole, scores, time)
 
@@ -136,13 +148,15 @@ def _rows(lines: list[str], first: int, layout: _Layout, path: Path, mark: str) 
         cells = _split(lines[i], mark)
         if len(cells) != width:
             raise PoiseError(
-                f"it has {len(cells)} columns and the header names {width}", at_line(path, i + 1)
+                f"it has {len(cells)} columns and the header names {width}",
+                at_line(path, i + 1),
+                code="row-width",
             )
         # Columns that are no points (a subject's name, a label) may hold anything.
         cells = [c if k in used else "" for k, c in enumerate(cells)]
         out.append(row_numbers(cells, lambda k: layout.header[k], path, i + 1))
     if not out:
-        raise PoiseError("the table has a header and no frames", path, CUT_OFF)
+        raise PoiseError("the table has a header and no frames", path, CUT_OFF, code="no-frames")
     return np.array(out)
 
 
@@ -156,7 +170,10 @@ def _rate(
         return number(stated["fps"], path.name)
     if layout.time is None:
         raise PoiseError(
-            "the table has neither times nor a frame rate", path, "State it with --fps FRAMES_PER_SECOND"
+            "the table has neither times nor a frame rate",
+            path,
+            "State it with --fps FRAMES_PER_SECOND",
+            code="rate-missing",
         )
     return measured_rate(table[:, layout.time], path)
 
@@ -164,12 +181,19 @@ def _rate(
 def measured_rate(times: np.ndarray, path: Path) -> float:
     """Frames per second of even times (s); uneven ones are refused with the frame."""
     if not np.isfinite(times).all():
-        raise PoiseError(f"frame {int(np.argwhere(~np.isfinite(times))[0][0])} has no time", path)
+        raise PoiseError(
+            f"frame {int(np.argwhere(~np.isfinite(times))[0][0])} has no time",
+            path,
+            code="times-unusable",
+        )
     steps = np.diff(times)
     step = float(np.median(steps)) if len(steps) else 0.0
     if not step > 0:
         raise PoiseError(
-            "its times do not increase", path, "State the rate with --fps FRAMES_PER_SECOND"
+            "its times do not increase",
+            path,
+            "State the rate with --fps FRAMES_PER_SECOND",
+            code="times-not-rising",
         )
     odd = np.flatnonzero(np.abs(steps / step - 1) > 0.5)
     if len(odd):
@@ -178,6 +202,7 @@ def measured_rate(times: np.ndarray, path: Path) -> float:
             f"before, the usual step is {step:.4g} s",
             path,
             "Resample the table, or state the rate with --fps FRAMES_PER_SECOND",
+            code="times-uneven",
         )
     # The mean step is more exact than the median of rounded times.
     return 1.0 / float(np.mean(steps))
@@ -239,28 +264,36 @@ def trc_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
 def _header(lines: list[str], path: Path) -> _Header:
     """The header's fields (lower-case name -> value), the labels, and the index of the first row."""
     if len(lines) <= _LABEL_LINE:
-        raise PoiseError("the file ends within its header", path, CUT_OFF)
+        raise PoiseError("the file ends within its header", path, CUT_OFF, code="file-cut-off")
     keys, values = (line.rstrip("\t ").split("\t") for line in lines[1:3])
     if len(values) < len(keys) or len(keys) < 2:
         keys, values = lines[1].split(), lines[2].split()
     fields = {k.strip().lower(): v.strip() for k, v in zip(keys, values, strict=False)}
     if "datarate" not in fields:
-        raise PoiseError("the TRC header has no DataRate", at_line(path, 2), CUT_OFF)
+        raise PoiseError(
+            "the TRC header has no DataRate", at_line(path, 2), CUT_OFF, code="rate-missing"
+        )
     cells = _cells(lines[_LABEL_LINE].rstrip("\t "))
     labels = [c.strip() for c in cells[2:] if c.strip()]
     if len(cells) < 3 or not cells[0].strip().lower().startswith("frame") or not labels:
         raise PoiseError(
             "the labels of the points were expected: Frame#, Time, then one per point",
             at_line(path, _LABEL_LINE + 1),
+            code="keyword-expected",
         )
     twice = next((name for name, count in Counter(labels).items() if count > 1), None)
     if twice is not None:
-        raise PoiseError(f"keypoint {shown(twice)} appears twice", at_line(path, _LABEL_LINE + 1))
+        raise PoiseError(
+            f"keypoint {shown(twice)} appears twice",
+            at_line(path, _LABEL_LINE + 1),
+            code="name-repeated",
+        )
     stated = fields.get("nummarkers", "")
     if stated.isdigit() and int(stated) != len(labels):
         raise PoiseError(
             f"the header states {stated} markers and there are {len(labels)} labels",
             at_line(path, _LABEL_LINE + 1),
+            code="count-differs",
         )
     return _Header(fields, tuple(labels), _first_row(lines))
 
@@ -296,11 +329,12 @@ def _rows_trc(lines: list[str], header: _Header, path: Path) -> np.ndarray:
                 f"it has {len(cells)} columns and needs {width}: frame, time and 3 for each of "
                 f"{len(header.names)} points",
                 at_line(path, i + 1),
+                code="row-width",
             )
         cells += [""] * (width - len(cells))
         out.append(row_numbers(cells, header.column, path, i + 1))
     if not out:
-        raise PoiseError("the file has a header and no frames", path, CUT_OFF)
+        raise PoiseError("the file has a header and no frames", path, CUT_OFF, code="no-frames")
     return np.array(out)
 
 
@@ -316,6 +350,7 @@ def _rate_trc(header: _Header, times: np.ndarray, path: Path, notes: list[str]) 
                 f"DataRate is {rate:g} and must be above 0",
                 at_line(path, 3),
                 "State the rate with --fps F",
+                code="rate-out-of-range",
             )
         notes.append(f"DataRate is {rate:g}: {measured:.5g} frames per second taken from the times")
         return measured

@@ -135,9 +135,11 @@ def check_options(options: ReadOptions) -> None:
         check_rate(options.fps, "--fps")
     for name, value in stated:
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise PoiseError(f"--{name} must be above 0, got {value}")
+            raise PoiseError(f"--{name} must be above 0, got {value}", code="out-of-range")
     if options.up_axis is not None and options.up_axis.upper() not in UPS:
-        raise PoiseError(f"--up must be one of {', '.join(UPS)}, got '{options.up_axis}'")
+        raise PoiseError(
+            f"--up must be one of {', '.join(UPS)}, got '{options.up_axis}'", code="unknown-axis"
+        )
 
 
 def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
@@ -233,12 +235,20 @@ def _rate(raw: RawMotion) -> str:
 
 def _check(raw: RawMotion) -> None:
     if len(raw.names) > MAX_JOINTS:
-        raise PoiseError(f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed", raw.path)
+        raise PoiseError(
+            f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed",
+            raw.path,
+            code="too-many-joints",
+        )
     if odd := [n for n in raw.names if not n.isprintable()]:
-        raise PoiseError(f"{shown(odd[0])} is no joint name", raw.path)
+        raise PoiseError(f"{shown(odd[0])} is no joint name", raw.path, code="not-a-name")
     check_frames(len(raw.root_pos), raw.path)
     if not np.abs(raw.offsets).max() > 0:
-        raise PoiseError("no bone of the skeleton has any length (all offsets are zero)", raw.path)
+        raise PoiseError(
+            "no bone of the skeleton has any length (all offsets are zero)",
+            raw.path,
+            code="skeleton-without-length",
+        )
 
 
 def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
@@ -257,7 +267,11 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
     pos, _ = posed(raw.parents, raw.offsets, raw.root_pos[at], rot[at])
     height, how = body_height(raw.names, raw.parents, raw.offsets, pos)
     if not height > 0:
-        raise PoiseError("the skeleton has no height (all joints lie in one place)", raw.path)
+        raise PoiseError(
+            "the skeleton has no height (all joints lie in one place)",
+            raw.path,
+            code="skeleton-without-length",
+        )
     if options.unit_m is not None:
         unit = stated_unit(height, options.unit_m, raw.path)
     elif raw.unit_m is not None:

@@ -29,7 +29,10 @@ def looks_like_asf(head: bytes) -> bool:
 def refuse_asf(path: Path, options: ReadOptions) -> NoReturn:
     """A skeleton alone does not move."""
     raise PoiseError(
-        "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
+        "an ASF file holds a skeleton without motion",
+        path,
+        "Give the AMC file, with --skeleton FILE",
+        code="skeleton-alone",
     )
 
 
@@ -49,12 +52,14 @@ def refuse_robot(path: Path, options: ReadOptions) -> NoReturn:
             "(qpos), which mean nothing without the robot's model",
             path,
             _HUMAN_HINT,
+            code="robot-motion",
         )
     raise PoiseError(
         "HDF5 files of motion (dm_control, MuJoCo) hold the joint angles of one fixed model, which "
         "mean nothing without it",
         path,
         _HUMAN_HINT,
+        code="robot-motion",
     )
 
 
@@ -82,6 +87,7 @@ def refuse_qpos(data: Mapping[str, Any], path: Path, options: ReadOptions) -> No
         "it holds the joint angles of a robot (qpos), which mean nothing without the robot's model",
         path,
         _HUMAN_HINT,
+        code="robot-motion",
     )
 
 
@@ -96,7 +102,7 @@ def refuse_array(shape: tuple[int, ...], path: Path) -> NoReturn:
         joints = (shape[0], shape[1] // 3, 3)
         what = f"its array of shape {shape} may be joints of shape {joints}, flattened"
         hint = f"If so, save it with reshape{joints}; save rotations as npz with poses and trans"
-    raise PoiseError(what, path, hint)
+    raise PoiseError(what, path, hint, code="array-unclear")
 
 
 def looks_like_openpose(head: bytes) -> bool:
@@ -106,13 +112,20 @@ def looks_like_openpose(head: bytes) -> bool:
 
 def refuse_openpose(path: Path, options: ReadOptions) -> NoReturn:
     """OpenPose's JSON holds the image coordinates of one frame of one camera."""
-    raise PoiseError("it holds the 2D keypoints of one camera's image (OpenPose)", path, FLAT_HINT)
+    raise PoiseError(
+        "it holds the 2D keypoints of one camera's image (OpenPose)",
+        path,
+        FLAT_HINT,
+        code="flat-keypoints",
+    )
 
 
 def refuse_folder(path: Path) -> NoReturn:
     """A folder is no motion; one of OpenPose's JSON files is told from others."""
     refuse_flat_folder(path)
-    raise PoiseError("this is a folder, not a motion file", path, "Name one file in it")
+    raise PoiseError(
+        "this is a folder, not a motion file", path, "Name one file in it", code="is-folder"
+    )
 
 
 def refuse_flat_folder(path: Path) -> None:
@@ -123,4 +136,9 @@ def refuse_flat_folder(path: Path) -> None:
         with first.open("rb") as file:
             if looks_like_openpose(file.read(4096).lstrip()):
                 what = "this folder holds the 2D keypoints of one camera (OpenPose), which have no depth"
-                raise PoiseError(what, path, f"{FLAT_HINT}; or estimate 3D poses from the video")
+                raise PoiseError(
+                    what,
+                    path,
+                    f"{FLAT_HINT}; or estimate 3D poses from the video",
+                    code="flat-keypoints",
+                )

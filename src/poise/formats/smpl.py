@@ -227,7 +227,9 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
     scale, world_unit = _scale(data, path, options)
     trans = numeric(data, _needed(data, _TRANS, path), (None, 3), path)
     if len(trans) != len(poses):
-        raise PoiseError(f"it has {len(poses)} poses but {len(trans)} translations", path)
+        raise PoiseError(
+            f"it has {len(poses)} poses but {len(trans)} translations", path, code="length-differs"
+        )
     refuse_bad(poses, "the rotation", path, layout.names)
     refuse_bad(trans, "the translation", path)
     # Roots may turn often, and fits of fingers are wild.
@@ -318,7 +320,7 @@ def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, Layout]:
         known = listed(f"{x.width} ({x.name})" for x in LAYOUTS)
         raise PoiseError(
             f"{what} has {poses.shape[1]} numbers a frame, which is no layout of SMPL", path,
-            f"Known: {known}",
+            f"Known: {known}", code="layout-unknown",
         )  # fmt: skip
     return poses.reshape(len(poses), len(layout.names), 3), layout
 
@@ -351,7 +353,11 @@ def _parts(data: Mapping[str, Any], path: Path) -> np.ndarray:
         hands = hands if hands is not None else np.zeros((frames, 90))
     found = [b for b in (*body, hands) if b is not None]
     if any(len(b) != frames for b in found):
-        raise PoiseError(f"its poses have different lengths: {listed(len(b) for b in found)}", path)
+        raise PoiseError(
+            f"its poses have different lengths: {listed(len(b) for b in found)}",
+            path,
+            code="length-differs",
+        )
     return np.concatenate(found, 1)
 
 
@@ -361,7 +367,9 @@ def _scale(data: Mapping[str, Any], path: Path, options: ReadOptions) -> tuple[f
     if "smpl_scaling" in data:
         scale = one_number(data, "smpl_scaling", path)
         if not scale > 0:
-            raise PoiseError(f"smpl_scaling is {scale:g}, which must be above 0", path)
+            raise PoiseError(
+                f"smpl_scaling is {scale:g}, which must be above 0", path, code="out-of-range"
+            )
     return scale, options.unit_m or 1.0
 
 
@@ -448,7 +456,10 @@ def _fps(data: Mapping[str, Any], path: Path, notes: list[str]) -> float:
         notes.append("The file states no frame rate: 30 frames per second taken, as HY-Motion has it")
         return _HY_FPS
     raise PoiseError(
-        f"the file states no frame rate (none of {listed(_RATES)})", path, "State it with --fps F"
+        f"the file states no frame rate (none of {listed(_RATES)})",
+        path,
+        "State it with --fps F",
+        code="rate-missing",
     )
 
 
@@ -493,7 +504,7 @@ def smpl_skeleton(layout: str = "SMPL") -> Skeleton:
     found = next((x for x in LAYOUTS if x.name == layout), None)
     if found is None:
         known = ", ".join(x.name for x in LAYOUTS)
-        raise PoiseError(f"there is no layout '{layout}'. Known: {known}")
+        raise PoiseError(f"there is no layout '{layout}'. Known: {known}", code="layout-unknown")
     tips = tuple((j, triple(vectors_to_z_up(np.array(tip), "Y"))) for j, tip in found.tips)
     offsets = vectors_to_z_up(found.offsets, "Y")
     return Skeleton(found.names, found.parents, offsets, tips, Source(format="smpl"))
@@ -520,6 +531,7 @@ def write_amass(clip: Clip, path: str | Path) -> None:
             f"the clip's {len(clip.skeleton)} joints are not those of SMPL, which AMASS files need",
             clip.name,
             "Retarget it to SMPL's skeleton first, or write .poise.npz, which holds any skeleton",
+            code="skeleton-differs",
         )
     kept = dict(clip.skeleton.source.extra) if clip.skeleton.source.format == "smpl" else {}
     up = kept.get("up", "Z")

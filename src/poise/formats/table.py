@@ -177,7 +177,9 @@ def _read(path: Path, options: ReadOptions) -> Clip:
         # A clip's own checks know its name only; what a file says may be long or obeyed by a terminal.
         raise brief(error, path) from None
     except MemoryError:
-        raise PoiseError("the file needs more memory than there is", path, "Cut it shorter") from None
+        raise PoiseError(
+            "the file needs more memory than there is", path, "Cut it shorter", code="out-of-memory"
+        ) from None
 
 
 def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
@@ -219,15 +221,19 @@ def _reader_of(path: Path) -> Reader:
                 return reader
     suffix = path.suffix.lower()
     if suffix in (".pt", ".pth"):
-        raise PoiseError("files of torch are pickles, which are not read", path, _TORCH)
+        raise PoiseError(
+            "files of torch are pickles, which are not read", path, _TORCH, code="pickle-refused"
+        )
     other = next((name for magic, name in _MAGIC if head.startswith(magic)), _NOT_YET.get(suffix))
     if other is not None:
-        raise PoiseError(f"{other} files are not read yet", path, READABLE)
+        raise PoiseError(f"{other} files are not read yet", path, READABLE, code="format-not-read")
     for reader in READERS:
         if suffix in reader.suffixes:
             return reader
     what = f"the suffix {shown(path.suffix)}" if path.suffix else "a file without suffix"
-    raise PoiseError(f"{what} and its content belong to no known motion format", path, READABLE)
+    raise PoiseError(
+        f"{what} and its content belong to no known motion format", path, READABLE, code="format-unknown"
+    )
 
 
 WRITERS: dict[str, Callable[[Clip, Path], None]] = {
@@ -289,5 +295,6 @@ def _writer(path: Path) -> Callable[[Clip, Path], None]:
             f"a clip cannot be written as {shown(path.suffix or path.name)}",
             path,
             f"Suffixes that can be written: {', '.join(WRITERS)}",
+            code="format-not-written",
         )
     return writer

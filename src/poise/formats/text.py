@@ -59,19 +59,22 @@ def check_file(path: Path, limit: int = MAX_FILE_BYTES) -> int:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         if isinstance(error, FileNotFoundError):
-            raise PoiseError("there is no such file", path) from None
-        raise PoiseError(f"the file cannot be opened ({reason})", path) from None
+            raise PoiseError("there is no such file", path, code="file-missing") from None
+        raise PoiseError(f"the file cannot be opened ({reason})", path, code="file-unreadable") from None
     if stat.S_ISDIR(info.st_mode):
-        raise PoiseError("this is a folder, not a motion file", path, "Name one file in it")
+        raise PoiseError(
+            "this is a folder, not a motion file", path, "Name one file in it", code="is-folder"
+        )
     if not stat.S_ISREG(info.st_mode):
-        raise PoiseError("this is not a regular file", path)
+        raise PoiseError("this is not a regular file", path, code="not-a-file")
     if info.st_size == 0:
-        raise PoiseError("the file is empty", path)
+        raise PoiseError("the file is empty", path, code="file-empty")
     if info.st_size > limit:
         raise PoiseError(
             f"the file has {info.st_size / 1e9:.2f} GB, more than the limit of {limit / 1e9:.2f} GB",
             path,
             "Cut it into shorter clips",
+            code="file-too-big",
         )
     return info.st_size
 
@@ -83,7 +86,9 @@ def read_head(path: Path) -> bytes:
         with path.open("rb") as file:
             return file.read(4096)
     except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+        raise PoiseError(
+            f"the file cannot be read ({error.strerror})", path, code="file-unreadable"
+        ) from None
 
 
 def below_comments(path: Path, most: int = 4 << 20) -> bytes:
@@ -101,7 +106,9 @@ def read_binary(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+        raise PoiseError(
+            f"the file cannot be read ({error.strerror})", path, code="file-unreadable"
+        ) from None
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -119,30 +126,39 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
                     chunk = _without_mark(chunk, path)
                 total += len(chunk)
                 if total > limit:
-                    raise PoiseError("the file grew beyond the limit while it was read", path)
+                    raise PoiseError(
+                        "the file grew beyond the limit while it was read", path, code="file-too-big"
+                    )
                 nul = chunk.find(b"\0")
                 if nul >= 0:
                     place = at_line(path, line + chunk.count(b"\n", 0, nul))
-                    raise PoiseError("binary data in a text file", place)
+                    raise PoiseError("binary data in a text file", place, code="not-text")
                 first, last = _breaks(chunk)
                 if run + first > MAX_LINE_BYTES:
                     raise PoiseError(
                         f"the line is longer than {MAX_LINE_BYTES / 1e6:.1f} MB, which no frame needs",
                         at_line(path, line),
+                        code="over-limit",
                     )
                 run = len(chunk) - last - 1 if last >= 0 else run + len(chunk)
                 line += chunk.count(b"\n") + chunk.count(b"\r") - chunk.count(b"\r\n")
                 if line > MAX_LINES:
-                    raise PoiseError(f"the file has more than {MAX_LINES} lines", path)
+                    raise PoiseError(
+                        f"the file has more than {MAX_LINES} lines", path, code="over-limit"
+                    )
                 chunks.append(chunk)
     except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+        raise PoiseError(
+            f"the file cannot be read ({error.strerror})", path, code="file-unreadable"
+        ) from None
     return b"".join(chunks)
 
 
 def _without_mark(chunk: bytes, path: Path) -> bytes:
     if chunk[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise PoiseError("the text is encoded as UTF-16", at_line(path, 1), "Save it as UTF-8")
+        raise PoiseError(
+            "the text is encoded as UTF-16", at_line(path, 1), "Save it as UTF-8", code="not-text"
+        )
     return chunk.removeprefix(b"\xef\xbb\xbf")
 
 
@@ -162,6 +178,7 @@ def decode(line: bytes, path: Path, number: int) -> str:
             f"byte 0x{line[error.start]:02x} is not UTF-8 text",
             at_line(path, number),
             "Save it as UTF-8",
+            code="not-text",
         ) from None
 
 
@@ -178,20 +195,26 @@ def json_object(data: bytes, path: Path) -> dict[str, Any]:
                 f"the JSON has {size} {what}, more than the {most} allowed",
                 path,
                 "Cut it into shorter clips",
+                code="over-limit",
             )
     try:
         content = json.loads(data.decode("utf-8"))
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise PoiseError("this is not UTF-8 text", at_line(path, line), "Save it as UTF-8") from None
+        raise PoiseError(
+            "this is not UTF-8 text", at_line(path, line), "Save it as UTF-8", code="not-text"
+        ) from None
     except json.JSONDecodeError as error:
         raise PoiseError(
-            f"this is not valid JSON ({error.msg})", at_line(path, error.lineno), CUT_OFF
+            f"this is not valid JSON ({error.msg})",
+            at_line(path, error.lineno),
+            CUT_OFF,
+            code="bad-json",
         ) from None
     except (RecursionError, ValueError):
-        raise PoiseError("this is not valid JSON", path) from None
+        raise PoiseError("this is not valid JSON", path, code="bad-json") from None
     if not isinstance(content, dict):
-        raise PoiseError("the JSON is no object", path)
+        raise PoiseError("the JSON is no object", path, code="not-an-object")
     return content
 
 
@@ -222,7 +245,7 @@ def others_note(name: str, joints: int, others: Sequence[tuple[str, int]]) -> st
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes a file, text as UTF-8, whole or not at all: beside its place, then into it."""
     if path.is_dir():
-        raise PoiseError("this is a folder; name a file to write", path)
+        raise PoiseError("this is a folder; name a file to write", path, code="is-folder")
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with beside.open("xb") as file:
@@ -234,7 +257,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
         beside.unlink(missing_ok=True) if beside.parent.is_dir() else None
         reason = error.strerror or str(error)
         raise PoiseError(
-            f"the file cannot be written ({reason})", path, "Choose a folder you may write to"
+            f"the file cannot be written ({reason})",
+            path,
+            "Choose a folder you may write to",
+            code="cannot-write",
         ) from None
 
 
@@ -251,9 +277,9 @@ def number(token: str | bytes, where: str) -> float:
             raise ValueError
         value = float(token)
     except ValueError:
-        raise PoiseError(f"{shown(token)} is not a number", where) from None
+        raise PoiseError(f"{shown(token)} is not a number", where, code="not-a-number") from None
     if not abs(value) <= MAX_VALUE:
-        raise PoiseError(f"{shown(token)} is not a usable number", where)
+        raise PoiseError(f"{shown(token)} is not a usable number", where, code="number-unusable")
     return value
 
 
@@ -274,7 +300,7 @@ def append_numbers(values: array[float], tokens: list[bytes], where: str) -> Non
             try:
                 float(token.replace(b"_", b"x"))
             except ValueError:
-                raise PoiseError(f"{shown(token)} is not a number", where) from None
+                raise PoiseError(f"{shown(token)} is not a number", where, code="not-a-number") from None
 
 
 def first_bad(table: np.ndarray) -> tuple[int, int] | None:
@@ -303,7 +329,7 @@ def number_table(
         tokens = lines[i].split(mark)
         if len(tokens) != width:
             what = f"the row has {len(tokens)} values; there are {width} columns"
-            raise PoiseError(what, at_line(path, i + 1))
+            raise PoiseError(what, at_line(path, i + 1), code="row-width")
         append_numbers(values, tokens, at_line(path, i + 1))
     return np.frombuffer(values, dtype=np.float64).reshape(-1, width)
 

@@ -46,7 +46,7 @@ def pxr_package() -> Any:
 
 def _missing() -> PoiseError:
     hint = "Install it with: pip install 'poise-motion[usd]'"
-    return PoiseError("USD files need the package usd-core", hint=hint)
+    return PoiseError("USD files need the package usd-core", hint=hint, code="extra-missing")
 
 
 def read_usd(path: Path, options: ReadOptions) -> Clip:
@@ -181,7 +181,9 @@ def _parts(m: np.ndarray, where: str, codes: np.ndarray) -> tuple[np.ndarray, np
     bad = ~(np.abs(m) <= MAX_VALUE).all((1, 2))
     if bad.any():
         raise PoiseError(
-            f"its transform is no usable number at time code {codes[bad.argmax()]:g}", where
+            f"its transform is no usable number at time code {codes[bad.argmax()]:g}",
+            where,
+            code="number-unusable",
         )
     turn, scale = turn_and_scale(m[:, :3, :3].transpose(0, 2, 1), "transform", where)
     return m[:, 3, :3], turn, scale
@@ -224,7 +226,7 @@ def write_usd(clip: Clip, path: str | Path) -> None:
         except pxr.Tf.ErrorException:
             written = False
         if not written:
-            raise PoiseError("USD could not make the file", path)
+            raise PoiseError("USD could not make the file", path, code="cannot-write")
         write_whole(path, layer.read_bytes())
 
 

@@ -34,7 +34,7 @@ def read(
     try:
         return _read(pxr, path, refuse, (joints, poses, value), fps, rest)
     except (pxr.Tf.ErrorException, UnicodeDecodeError):
-        refuse("USD cannot read the file", _CUT)
+        refuse("USD cannot read the file", _CUT, code="file-damaged")
 
 
 def _read(
@@ -46,14 +46,16 @@ def _read(
     rig, query = found.rig, found.query
     count = len(query.GetJointOrder())
     if not 0 < count <= limits[0]:
-        refuse(f"it has {count} joints; 1 to {limits[0]} are read")
+        refuse(f"it has {count} joints; 1 to {limits[0]} are read", code="joint-count")
     order = [str(j) for j in query.GetJointOrder()]
     parents = [int(p) for p in query.GetTopology().GetParentIndices()]
     stated = [str(n) for n in rig.GetJointNamesAttr().Get() or []]
     codes, rate = _codes(stage, found, count, fps, limits, refuse, notes)
     local = [np.array(query.ComputeJointLocalTransforms(c)) for c in codes]
     if any(x.shape != (count, 4, 4) for x in local):
-        refuse("its animation and rest transforms do not give every joint a place")
+        refuse(
+            "its animation and rest transforms do not give every joint a place", code="rest-pose-unknown"
+        )
     form = pxr.UsdGeom.Xformable(rig)
     when = codes if any(len(s) > 1 for s in found.above) else codes[:1]
     animation = query.GetAnimQuery()
@@ -90,7 +92,7 @@ def _stage(pxr: Any, path: str, refuse: Refuse) -> Any:
         packed = file.read(4) == b"PK\x03\x04"
     layer = _packed(pxr, path, refuse) if packed else pxr.Sdf.Layer.OpenAsAnonymous(path)
     if layer is None:
-        refuse("USD cannot read the file", _CUT)
+        refuse("USD cannot read the file", _CUT, code="file-damaged")
     others = sorted(x for x in set(layer.GetCompositionAssetDependencies()) if x)
     if others:
         some = ", ".join(
@@ -100,6 +102,7 @@ def _stage(pxr: Any, path: str, refuse: Refuse) -> Any:
         refuse(
             f"it is put together from other files ({some}{more})",
             "Flatten it into one file first: usdcat --flatten IN -o OUT",
+            code="layers-apart",
         )
     return pxr.Usd.Stage.Open(layer)
 
@@ -109,17 +112,21 @@ def _packed(pxr: Any, path: str, refuse: Refuse) -> Any:
     with Path(path).open("rb") as file:
         head = file.read(30)
         if len(head) < 30:
-            refuse("USD cannot read the file", _CUT)
+            refuse("USD cannot read the file", _CUT, code="file-damaged")
         flags, method = struct.unpack("<2H", head[6:10])
         size, whole, name_size, extra = struct.unpack("<2I2H", head[18:30])
         name = file.read(name_size).decode("utf-8", "replace").lower()
         suffix = next((s for s in (".usda", ".usdc", ".usd") if name.endswith(s)), None)
         if suffix is None or method or flags & 0x9 or size != whole:
-            refuse("its first file is no plain USD layer, as a USDZ package needs", _CUT)
+            refuse(
+                "its first file is no plain USD layer, as a USDZ package needs",
+                _CUT,
+                code="file-damaged",
+            )
         file.seek(extra, 1)
         data = file.read(size)
     if len(data) < size:
-        refuse("USD cannot read the file", _CUT)
+        refuse("USD cannot read the file", _CUT, code="file-damaged")
     with tempfile.TemporaryDirectory() as folder:
         inner = Path(folder) / f"layer{suffix}"
         inner.write_bytes(data)
@@ -188,19 +195,20 @@ def _skeletons(
         if query and (animation or one.moves() or rest):
             found.append(one)
     if large and not found:
-        refuse(f"it has {large} joints; 1 to {most} are read")
+        refuse(f"it has {large} joints; 1 to {most} are read", code="joint-count")
     if large:
         notes.append(f"A skeleton of {large} joints was passed over; 1 to {most} are read")
     if not found and not all(_in_order(UsdSkel, rig) for rig in bare):
-        refuse("its joints do not stand with parents before children")
+        refuse("its joints do not stand with parents before children", code="parent-order")
     if not found and bare:
         refuse(
             "the file holds no animation of a skeleton (UsdSkel): none is bound to its skeleton",
             "Bind one with skel:animationSource (SkelBindingAPI, below a SkelRoot); as it rests it "
             "serves `poise retarget --onto` alone",
+            code="no-animation",
         )
     if not found:
-        refuse("the file holds no animation of a skeleton (UsdSkel)")
+        refuse("the file holds no animation of a skeleton (UsdSkel)", code="no-animation")
     moving = [f for f in found if len(f.joints) > 1] or [f for f in found if f.moves()] or found
     best = moving[0]
     if rest and not best.query.GetAnimQuery() and not best.moves():
@@ -234,7 +242,7 @@ def _codes(
     sources = [s for s in (found.joints, *found.above) if len(s)]
     samples = np.unique(np.concatenate(sources)) if sources else np.zeros(1)
     if not (np.abs(samples) <= limits[2]).all() or not 0 < per_second <= limits[2]:
-        refuse("its time codes are no usable numbers")
+        refuse("its time codes are no usable numbers", code="times-unusable")
     if len(samples) == 1:
         return np.repeat(samples, 2), fps or per_second
     steady = [s for s in sources if len(s) > 2 and _even(s)] or [s for s in sources if len(s) > 1]
@@ -258,11 +266,13 @@ def _codes(
         refuse(
             f"its {len(samples)} keys would become {count} frames at {per_second / step:.6g} per second",
             "State a lower rate with --fps F",
+            code="clip-too-long",
         )
     if count * joints > limits[1]:
         refuse(
             f"it has {count} frames of {joints} joints, more than the {limits[1]} poses that are read",
             "Cut it shorter, or state a lower rate with --fps F",
+            code="clip-too-long",
         )
     return samples if even else start + step * np.arange(count), per_second / step
 

@@ -158,11 +158,18 @@ def complete(
     """
     config = changed(config or TrackConfig(), settings)
     if config.count > 1 or config.recover or config.noise:
-        raise PoiseError("keyframes are completed for a single character, without noise or recovery")
+        raise PoiseError(
+            "keyframes are completed for a single character, without noise or recovery",
+            code="settings-conflict",
+        )
     if config.lookahead == LookaheadConfig():
         config = replace(config, lookahead=replace(LookaheadConfig().with_budget(BUDGET), slack=SLACK))
     if retime and config.retake is not None:
-        raise PoiseError("a range has the times of the earlier result", hint="Leave --retime out")
+        raise PoiseError(
+            "a range has the times of the earlier result",
+            hint="Leave --retime out",
+            code="settings-conflict",
+        )
     source, said = _calm(clip_of(clip))
     # What is filled or retimed keeps the clip's time only where neither is asked for.
     timed_anew = retime or times is not None
@@ -178,7 +185,7 @@ def complete(
     for sparse in partial:
         if not keys[0] < sparse.frame < keys[-1]:
             what = f"a keyframe of parts must lie between keyframes, got frame {sparse.frame}"
-            raise PoiseError(what, source.name)
+            raise PoiseError(what, source.name, code="keyframe-misplaced")
     given, asked = source, keys
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
     config.direction.check(given, tracker.humanoid.table)

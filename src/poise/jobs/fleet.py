@@ -104,7 +104,7 @@ def run_fleet(
         PoiseError: two jobs have one name, or `folder` holds a table of another version.
     """
     if len({job.name for job in jobs}) != len(jobs):
-        raise PoiseError("two jobs of the fleet have the same name", folder)
+        raise PoiseError("two jobs of the fleet have the same name", folder, code="name-repeated")
     fleet = _Fleet(jobs, folder, workers, retries, on_event or (lambda event, record: None))
     try:
         fleet.run()
@@ -219,7 +219,10 @@ def read_table(folder: Path) -> dict[str, Record]:
         return {entry["name"]: Record(**entry) for entry in table["jobs"]}
     except (ValueError, KeyError, TypeError):
         raise PoiseError(
-            "the table of the fleet is damaged or of another version", path, "Choose another folder"
+            "the table of the fleet is damaged or of another version",
+            path,
+            "Choose another folder",
+            code="file-damaged",
         ) from None
 
 

@@ -159,7 +159,11 @@ def imitate(
     stated = config is not None or set(settings) - {"seed"} or callbacks is not None
     if policy is not None and (stated or len(several) > 1):
         what = "several clips are" if len(several) > 1 else "settings of the recipe are for what is"
-        raise PoiseError(f"{what} learned from nothing, and a policy was given", hint="Leave one out")
+        raise PoiseError(
+            f"{what} learned from nothing, and a policy was given",
+            hint="Leave one out",
+            code="settings-conflict",
+        )
     config = changed(config or ResidualForce(), settings)
     library = ClipLibrary.of([clip_of(c) for c in several])
     run = Path(tempfile.mkdtemp(prefix="poise-")) if folder is None else Path(folder) / RUN
@@ -184,9 +188,11 @@ def imitate(
 def _limit(minutes: float, iterations: int | None) -> Until:
     """When the training ends, at the latest."""
     if iterations is not None and iterations < 1:
-        raise PoiseError(f"iterations must be at least 1, got {iterations}")
+        raise PoiseError(f"iterations must be at least 1, got {iterations}", code="out-of-range")
     if iterations is None and not minutes > 0:
-        raise PoiseError(f"minutes must be above 0, got {minutes:g}", hint="Or give iterations")
+        raise PoiseError(
+            f"minutes must be above 0, got {minutes:g}", hint="Or give iterations", code="out-of-range"
+        )
     return Until(minutes=minutes if minutes > 0 else None, iterations=iterations)
 
 

@@ -28,17 +28,34 @@ def may_write(path: Path, force: bool, *read: Path, flag: str = "--force") -> No
         PoiseError: a file that is there or is read; a folder, a symbolic link, a pipe or a device.
     """
     if path.is_symlink():
-        raise PoiseError("is a symbolic link, which a file would replace", path, "Name the file itself")
+        raise PoiseError(
+            "is a symbolic link, which a file would replace",
+            path,
+            "Name the file itself",
+            code="is-link",
+        )
     if not path.exists():
         return
     if any(source.exists() and path.samefile(source) for source in read):
-        raise PoiseError("the clip would be written over itself", path, "Give OUT another name")
+        raise PoiseError(
+            "the clip would be written over itself",
+            path,
+            "Give OUT another name",
+            code="would-overwrite-source",
+        )
     if path.is_dir():
-        raise PoiseError("is a folder", path, "Name a file in it")
+        raise PoiseError("is a folder", path, "Name a file in it", code="is-folder")
     if not path.is_file():
-        raise PoiseError("is a pipe or a device, which a file would replace", path, "Name a file")
+        raise PoiseError(
+            "is a pipe or a device, which a file would replace", path, "Name a file", code="not-a-file"
+        )
     if not force:
-        raise PoiseError("is there already", path, f"Choose another name, or write over it with {flag}")
+        raise PoiseError(
+            "is there already",
+            path,
+            f"Choose another name, or write over it with {flag}",
+            code="would-overwrite",
+        )
 
 
 def may_deliver(
@@ -81,7 +98,12 @@ def _make(folder: Path, made: list[Path]) -> None:
             missing.append(path)
             path = path.parent
         if not path.is_dir():
-            raise PoiseError(f"cannot be made, since {path} is a file", folder, "Choose another folder")
+            raise PoiseError(
+                f"cannot be made, since {path} is a file",
+                folder,
+                "Choose another folder",
+                code="not-a-folder",
+            )
         for path in reversed(missing):
             path.mkdir()
             made.append(path)
@@ -94,4 +116,6 @@ def refusing(path: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError) as problem:
         reason = (getattr(problem, "strerror", None) or str(problem)).lower()
-        raise PoiseError(f"cannot be written ({reason})", path, "Choose another folder") from None
+        raise PoiseError(
+            f"cannot be written ({reason})", path, "Choose another folder", code="cannot-write"
+        ) from None

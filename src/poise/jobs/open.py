@@ -78,7 +78,9 @@ class Run:
             PoiseError: a policy or network file, which holds no clips.
         """
         if self.file is None or self.recipe == INBETWEEN:
-            raise PoiseError("it holds no clips to simulate", self.path, "Give the folder of a run")
+            raise PoiseError(
+                "it holds no clips to simulate", self.path, "Give the folder of a run", code="not-a-run"
+            )
         if self.recipe == PERPETUAL["name"]:
             return perpetual_run.reopen(self.file)
         return build(self.file.library(), self.config)
@@ -101,7 +103,11 @@ class Run:
             PoiseError: a run of another recipe, or nothing was trained in it.
         """
         if self.recipe == INBETWEEN:
-            raise PoiseError("it holds a network that fills keyframes, and no policy", self.path)
+            raise PoiseError(
+                "it holds a network that fills keyframes, and no policy",
+                self.path,
+                code="wrong-file-kind",
+            )
         return load_tracker(self.path) if self.file is None else policy_of_run(self.file)
 
     @cached_property
@@ -113,7 +119,12 @@ class Run:
         """
         if self.recipe != INBETWEEN:
             hint = "Give a run of poise train inbetween"
-            raise PoiseError("it holds a policy, and no network that fills keyframes", self.path, hint)
+            raise PoiseError(
+                "it holds a policy, and no network that fills keyframes",
+                self.path,
+                hint,
+                code="wrong-file-kind",
+            )
         return load_model(self.path)
 
     def evaluate(
@@ -150,12 +161,20 @@ class Run:
         names = self.task.library.names
         if isinstance(clip, str):
             if clip not in names:
-                raise PoiseError(f"the run has no clip '{clip}'. {did_you_mean(clip, names)}", self.path)
+                raise PoiseError(
+                    f"the run has no clip '{clip}'. {did_you_mean(clip, names)}",
+                    self.path,
+                    code="unknown-clip",
+                )
             clip = names.index(clip)
         if not 0 <= clip < len(names):
-            raise PoiseError(f"the run has clips 0 to {len(names) - 1}, got {clip}", self.path)
+            raise PoiseError(
+                f"the run has clips 0 to {len(names) - 1}, got {clip}", self.path, code="index-outside"
+            )
         if not 0 <= frame < int(self.task.reference.length[clip]) - 1:
-            raise PoiseError(f"'{names[clip]}' has no step after its frame {frame}", self.path)
+            raise PoiseError(
+                f"'{names[clip]}' has no step after its frame {frame}", self.path, code="frame-outside"
+            )
         starts = torch.tensor([clip]), torch.tensor([frame])
         return evaluate(self.task, *self.trained, starts=starts)
 
@@ -208,7 +227,7 @@ def open_run(path: Path | str | None = None) -> Run:
         path = path / MODEL
     if not path.exists():
         hint = f"Give the folder of a run or a result, a policy file, or {', '.join(POLICIES)}"
-        raise PoiseError("there is no such file or folder", path, hint)
+        raise PoiseError("there is no such file or folder", path, hint, code="file-missing")
     if path.is_dir():
         return _folder(run_folder(path))
     _, meta = load_checkpoint(path)
@@ -231,7 +250,9 @@ def _folder(folder: Path) -> Run:
     file = RunFile(path, meta, tensors)
     known = {PERPETUAL["name"]: perpetual_config, RESIDUAL_FORCE["name"]: config_of}
     if file.recipe not in known:
-        raise PoiseError(f"there is no recipe '{json.dumps(file.recipe)[1:40]}'", path)
+        raise PoiseError(
+            f"there is no recipe '{json.dumps(file.recipe)[1:40]}'", path, code="unknown-recipe"
+        )
     return Run(folder, file.recipe, known[file.recipe](meta["config"], path), file)
 
 
@@ -249,6 +270,7 @@ def policy_of_run(file: RunFile) -> Tracker:
             "its policy knows only the clips that it was trained on, and cannot track others",
             folder,
             "Give the run of poise train perpetual, or imitate the clip with poise imitate",
+            code="policy-of-own-clips",
         )
     config, example = perpetual_config(file.meta["config"], file.path), file.library().clips[0]
     humanoid = None if config.body.mjcf else file.body(example.skeleton)

@@ -41,8 +41,16 @@ def preset_of(recipe: str, name: str, clip: Clip | None = None) -> Any:
         PoiseError: a recipe or a preset that there is not.
     """
     if recipe not in _PRESETS:
-        raise PoiseError(f"there is no recipe '{recipe}'", hint=did_you_mean(recipe, list(_PRESETS)))
+        raise PoiseError(
+            f"there is no recipe '{recipe}'",
+            hint=did_you_mean(recipe, list(_PRESETS)),
+            code="unknown-recipe",
+        )
     known = _PRESETS[recipe]
     if name not in known:
-        raise PoiseError(f"{recipe} has no preset '{name}'", hint=did_you_mean(name, list(known)))
+        raise PoiseError(
+            f"{recipe} has no preset '{name}'",
+            hint=did_you_mean(name, list(known)),
+            code="unknown-preset",
+        )
     return known[name](clip)

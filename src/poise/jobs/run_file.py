@@ -108,7 +108,9 @@ class RunFile:
         try:
             return ClipLibrary(tuple(unpack_clips(self.tensors, self.meta["clips"])))
         except PoiseError as problem:
-            raise PoiseError(problem.what, problem.where or self.path, problem.hint) from None
+            raise PoiseError(
+                problem.what, problem.where or self.path, problem.hint, code=problem.code
+            ) from None
 
     def table(self) -> BodyTable | None:
         """The body of the policy that the run went on from, None where it made its own."""
@@ -124,14 +126,21 @@ class RunFile:
             return None
         made = make_humanoid(skeleton, self._table(self.meta["body"]["table"]))
         if made.identity != self.meta.get("character"):
-            raise PoiseError("its body is not that of its policy", self.path, "The file is damaged")
+            raise PoiseError(
+                "its body is not that of its policy",
+                self.path,
+                "The file is damaged",
+                code="file-damaged",
+            )
         return made
 
     def _table(self, data: Any) -> BodyTable:
         try:
             return BodyTable.from_dict(data)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as problem:
-            raise PoiseError(f"the body in it cannot be read ({problem})", self.path) from None
+            raise PoiseError(
+                f"the body in it cannot be read ({problem})", self.path, code="file-damaged"
+            ) from None
 
 
 def run_folder(path: Path) -> Path:
@@ -144,12 +153,18 @@ def run_folder(path: Path) -> Path:
         if (folder / RUN_FILE).exists():
             return folder
     if not path.exists():
-        raise PoiseError("there is no such folder", path, "Give the folder of a result or a run")
+        raise PoiseError(
+            "there is no such folder", path, "Give the folder of a result or a run", code="file-missing"
+        )
     if (path / "score.json").exists():
         hint = "Its score is score.json and its page report.html; or give the run of the policy"
-        raise PoiseError("is a result of poise track, which has no run of its own", path, hint)
+        raise PoiseError(
+            "is a result of poise track, which has no run of its own", path, hint, code="not-a-run"
+        )
     what = f"is no run folder: there is no {RUN_FILE} in it"
-    raise PoiseError(what, path, "Give the folder of a result, or the 'run' folder in it")
+    raise PoiseError(
+        what, path, "Give the folder of a result, or the 'run' folder in it", code="not-a-run"
+    )
 
 
 def read_run(folder: Path) -> RunFile:
@@ -185,22 +200,31 @@ def held_run(
     """
     file = read_run(folder)
     if file.recipe != recipe:
-        raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
+        raise PoiseError(
+            "the folder holds a run of another recipe",
+            folder,
+            "Choose another folder",
+            code="recipe-differs",
+        )
     # As this version reads it, so that a run of an older one is compared in what it knew, too.
     here, there = to_data(config), to_data(read(file.meta["config"], file.path))
     # How long the expert was cloned is over and done; a run keeps its own.
     names = sorted(k for k in here if k != "clone" and here[k] != there[k])
     if names:
         what = f"the folder holds a run with other settings ({', '.join(names)})"
-        raise PoiseError(what, folder, "Resume it as it is or choose another folder")
+        raise PoiseError(
+            what, folder, "Resume it as it is or choose another folder", code="settings-differ"
+        )
     if source is not None and file.meta.get("source", "") != source:
         what = f"the folder holds a run on the library {file.meta.get('source') or 'of a program'}"
-        raise PoiseError(what, folder, "Give that library, or choose another folder")
+        raise PoiseError(
+            what, folder, "Give that library, or choose another folder", code="library-differs"
+        )
     clips = file.meta["clips"]
     if library is not None and clips != _as_known(clips, library):
         more = f" and {len(clips) - 6} more" if len(clips) > 6 else ""
         what = f"the folder holds a run of other clips ({', '.join(c['name'] for c in clips[:6])}{more})"
-        raise PoiseError(what, folder, "Give those clips, or choose another folder")
+        raise PoiseError(what, folder, "Give those clips, or choose another folder", code="clips-differ")
     return file
 
 
@@ -243,7 +267,12 @@ def latest_policy(folder: Path) -> Path:
     """
     path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
     if not path.exists():
-        raise PoiseError("nothing has been trained in it yet", folder, "Train it with --resume first")
+        raise PoiseError(
+            "nothing has been trained in it yet",
+            folder,
+            "Train it with --resume first",
+            code="nothing-trained",
+        )
     return path
 
 
@@ -266,5 +295,5 @@ def policy_for(folder: Path, humanoid: Humanoid, most: float) -> tuple[PolicyBun
         return policy, policy.meta | policy.meta.get("metadata", {}) | {"help_limit": 0.0}
     left = scale_in(load_checkpoint(path)[0]) * most
     if not math.isfinite(left):
-        raise PoiseError("the help that is left in it is no number", path)
+        raise PoiseError("the help that is left in it is no number", path, code="file-damaged")
     return policy, {**policy.meta, "help_limit": left}

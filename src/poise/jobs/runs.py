@@ -75,7 +75,12 @@ def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str
         meta = {"recipe": RECIPE["name"], "config": to_data(config)}
         write_run(folder, library, meta | body_facts(imitation.humanoid, imitation.library.names))
     elif file.meta.get("character") != imitation.humanoid.identity:
-        raise PoiseError("the folder holds a run of another body", folder, "Choose another folder")
+        raise PoiseError(
+            "the folder holds a run of another body",
+            folder,
+            "Choose another folder",
+            code="bodies-differ",
+        )
     return imitation
 
 
@@ -121,6 +126,7 @@ def help_left(
         raise PoiseError(
             f"the policy was trained with help of at most {most:g} N, so it cannot have {limit:g} N",
             hint=f"Give a limit from 0 to {most:g}",
+            code="out-of-range",
         )
     return limit, limit / most if most else 0.0
 
@@ -171,7 +177,9 @@ def score(
     """
     if starts < 1:
         raise PoiseError(
-            f"an evaluation needs at least 1 start, got {starts}", hint="Give 8, for example"
+            f"an evaluation needs at least 1 start, got {starts}",
+            hint="Give 8, for example",
+            code="out-of-range",
         )
     make, limit = _worlds(imitation, meta, help_limit, device)
     clip, frame = (x.repeat(starts) for x in start_frames(imitation.reference))
@@ -200,7 +208,11 @@ def transitions(
     """Every step of the episodes of `evaluate`, see `record_transitions`."""
     make, _ = _worlds(imitation, meta, help_limit, device)
     if most is not None and most < 1:
-        raise PoiseError(f"at least 1 start frame is needed, got {most}", hint="Give 32, for example")
+        raise PoiseError(
+            f"at least 1 start frame is needed, got {most}",
+            hint="Give 32, for example",
+            code="out-of-range",
+        )
     starts = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
     return record_transitions(make, _on(policy, device), *starts, noise, seed)
 

@@ -117,7 +117,7 @@ class Tracker:
         """
         config = self.config
         if not config.body.damping:
-            raise PoiseError("the policy's body has no damping that could be scaled")
+            raise PoiseError("the policy's body has no damping that could be scaled", code="no-damping")
         share = seconds / config.body.damping
         table = self.humanoid.table
         table = replace(table, rows=tuple(replace(r, kd=r.kd * share) for r in table.rows))
@@ -181,6 +181,7 @@ def load_tracker(path: Path) -> Tracker:
             f"'{humanoid.identity}'",
             path,
             "Export it anew from its run",
+            code="bodies-differ",
         )
     bundle.meta = {"samples": about.get("samples", 0), "seconds": about.get("seconds", 0.0)}
     return Tracker(bundle, humanoid, example, config, about, recovery_clips, value)
@@ -196,8 +197,15 @@ def check_policy_file(meta: Mapping[str, Any], path: Path) -> None:
         where = path.parent if (path.parent / RUN_FILE).exists() else None
         hint = f"Give the folder {where}" if where else "Give the run's folder, or a policy file"
         if meta.get("kind") == "run":
-            raise PoiseError("it holds a run's clips and settings alone", path, hint)
-        raise PoiseError("it holds a policy's weights without the body that they move", path, hint)
+            raise PoiseError(
+                "it holds a run's clips and settings alone", path, hint, code="not-a-policy"
+            )
+        raise PoiseError(
+            "it holds a policy's weights without the body that they move",
+            path,
+            hint,
+            code="policy-without-body",
+        )
     if meta.get("tracker") != VERSION:
         raise _foreign(meta, path)
     check_data(TrackerMeta, meta, path)
@@ -209,6 +217,7 @@ def _foreign(meta: Mapping[str, Any], path: Path) -> PoiseError:
         f"the policy was written by Poise {wrote} and does not fit this version, {__version__}",
         path,
         "Export it anew from its run, or install that version",
+        code="version-differs",
     )
 
 

@@ -176,11 +176,14 @@ def widened(tracker: Tracker, imitation: Imitation, steps: int = MEASURED) -> Wa
         raise PoiseError(
             f"the policy observes '{name}' of {len(told[name])} numbers, and the task does not{there}",
             hint="Take the policy's own settings of what is observed; more may be added to them",
+            code="policy-unfit",
         )
     columns, wide = torch.cat([asked[n] for n in told]), sum(map(len, asked.values()))
     if len(columns) != tracker.policy.num_obs:
         what = f"it observes {tracker.policy.num_obs} numbers, and on this body they are {len(columns)}"
-        raise PoiseError(what, hint="A policy goes on with the body that it was trained on")
+        raise PoiseError(
+            what, hint="A policy goes on with the body that it was trained on", code="policy-unfit"
+        )
     policy, critic = tracker.policy.widened(wide, columns), None
     if tracker.value is not None:
         own = tracker.value.state()

@@ -225,6 +225,7 @@ def _import_ray() -> Any:
         raise PoiseError(
             "--address needs Ray, which is not installed",
             hint="Install it with: pip install 'poise-motion[fleet]', or leave --address out",
+            code="extra-missing",
         ) from None
 
 
@@ -234,7 +235,11 @@ def _check_answer(address: str) -> None:
     if address != "auto":
         if not colon or not host or not port.isdecimal() or not 0 < int(port) < 2**16:
             hint = "Write HOST:PORT, ray://HOST:PORT, auto or local"
-            raise PoiseError(f"--address '{address}' is no address of a Ray cluster", hint=hint)
+            raise PoiseError(
+                f"--address '{address}' is no address of a Ray cluster",
+                hint=hint,
+                code="address-malformed",
+            )
         try:
             socket.create_connection((host, int(port)), timeout=ANSWER_S / 2).close()
         except OSError as problem:
@@ -258,4 +263,4 @@ def _no_answer(address: str, reason: str) -> PoiseError:
         "Start it with 'ray start --head', with the same RAY_AUTH_MODE and token as here, or leave "
         "--address out to use this machine alone"
     )
-    return PoiseError(f"does not answer ({reason.rstrip('.')})", where, hint)
+    return PoiseError(f"does not answer ({reason.rstrip('.')})", where, hint, code="no-answer")

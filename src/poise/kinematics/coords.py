@@ -172,6 +172,7 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
             f"its joints ({', '.join(skeleton.names[:6])}, ...) are not those of this character "
             f"({', '.join(r.name for r in rows[:6])}, ...)",
             clip.name,
+            code="skeleton-differs",
         )
     pos, quat = forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *clip.tensors())
     pelvis = rows[0].joint
@@ -206,7 +207,11 @@ def qpos_to_clip(
         rot[..., 0] = 1.0
     else:
         if template.frames != frames:
-            raise PoiseError(f"the template has {template.frames} frames and the motion {frames}", name)
+            raise PoiseError(
+                f"the template has {template.frames} frames and the motion {frames}",
+                name,
+                code="length-differs",
+            )
         rot = template.tensors()[1]
     pelvis = rows[0].joint
     # Joints above the pelvis keep their rotation; the pelvis' own takes up the difference.

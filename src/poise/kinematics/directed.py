@@ -68,11 +68,15 @@ def end_of(skeleton: Skeleton, limb: str) -> int:
         PoiseError: no such limb, or the skeleton has none.
     """
     if limb not in LIMBS:
-        raise PoiseError(f"there is no limb '{limb}'", hint=did_you_mean(limb, list(LIMBS)))
+        raise PoiseError(
+            f"there is no limb '{limb}'", hint=did_you_mean(limb, list(LIMBS)), code="unknown-limb"
+        )
     side, kind = limb.split("_")
     joints = find_anatomy(skeleton).of(kind, side)
     if not joints:
-        raise PoiseError(f"the skeleton has no {side} {kind}", hint="Name another limb")
+        raise PoiseError(
+            f"the skeleton has no {side} {kind}", hint="Name another limb", code="body-part-missing"
+        )
     return joints[0]
 
 
@@ -97,6 +101,7 @@ def check_asked(clip: Clip, asked: Sequence[Pin | TouchPoint]) -> None:
                 f"{what.limb} is wanted in frames {first} to {last}, and the clip has 0 to "
                 f"{clip.frames - 1}",
                 clip.name,
+                code="frame-outside",
             )
         if isinstance(what, Pin) or what.limb != PELVIS:
             end_of(clip.skeleton, what.limb)

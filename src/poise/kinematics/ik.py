@@ -71,25 +71,28 @@ def _gather(
     """Positions `(T, P, 3)` in the body's order (NaN for toes that are not given), rotations alike."""
     rows = len(body.table.rows)
     if positions.ndim != 3 or positions.shape[-1] != 3 or not len(positions):
-        raise PoiseError(f"positions must be (T, joints, 3), got {positions.shape}")
+        raise PoiseError(f"positions must be (T, joints, 3), got {positions.shape}", code="wrong-shape")
     names = tuple(names) if names is not None else body.points[: positions.shape[1]]
     if len(names) != positions.shape[1] or (
         rotations is not None and rotations.shape != (*positions.shape[:2], 4)
     ):
         raise PoiseError(
             f"there are {len(names)} joint names for positions of shape {positions.shape}"
-            + ("" if rotations is None else f" and rotations of shape {rotations.shape}")
+            + ("" if rotations is None else f" and rotations of shape {rotations.shape}"),
+            code="count-differs",
         )
     for name in body.points[:rows]:
         if name not in names:
-            raise PoiseError(f"the position of '{name}' is missing. {did_you_mean(name, names)}")
+            raise PoiseError(
+                f"the position of '{name}' is missing. {did_you_mean(name, names)}", code="joint-missing"
+            )
     at = [names.index(n) if n in names else -1 for n in body.points]
     points = positions[:, at]
     points[:, [i for i, a in enumerate(at) if a < 0]] = np.nan
     bad = ~np.isfinite(points[:, [i for i, a in enumerate(at) if a >= 0]])
     if bad.any():
         frame = int(np.argwhere(bad)[0][0])
-        raise PoiseError(f"a joint position is not finite at frame {frame}")
+        raise PoiseError(f"a joint position is not finite at frame {frame}", code="not-finite")
     if rotations is None:
         return torch.tensor(points), None
     turns = torch.tensor(np.asarray(rotations, dtype=np.float64)[:, at[:rows]])
@@ -317,10 +320,15 @@ def _checked(
     known, out = IkBody.of(humanoid).points, {}
     for name, goal in targets.items():
         if name not in known:
-            raise PoiseError(f"there is no body or toe '{name}'. {did_you_mean(name, known)}")
+            raise PoiseError(
+                f"there is no body or toe '{name}'. {did_you_mean(name, known)}", code="unknown-body"
+            )
         out[name] = np.asarray(goal, dtype=np.float64)
         if out[name].shape != (frames, 3):
-            raise PoiseError(f"the target of '{name}' must be ({frames}, 3), got {out[name].shape}")
+            raise PoiseError(
+                f"the target of '{name}' must be ({frames}, 3), got {out[name].shape}",
+                code="wrong-shape",
+            )
     return out
 
 
@@ -330,6 +338,8 @@ def _mink() -> Any:
         import mink
     except ImportError:
         raise PoiseError(
-            "the polish step needs the package mink", hint="pip install 'poise-motion[ik]'"
+            "the polish step needs the package mink",
+            hint="pip install 'poise-motion[ik]'",
+            code="extra-missing",
         ) from None
     return mink

@@ -50,11 +50,14 @@ class IkConfig:
 
     def __post_init__(self) -> None:
         if self.faithful not in ("corrected", "paper"):
-            raise PoiseError(f"faithful must be corrected or paper, got '{self.faithful}'")
+            raise PoiseError(
+                f"faithful must be corrected or paper, got '{self.faithful}'", code="unknown-choice"
+            )
         if not (0.0 < self.straight < math.pi / 2 and self.hold_frames > 0.0):
             raise PoiseError(
                 "straight must lie between 0 and pi / 2 and hold_frames above 0, got "
-                f"{self.straight:g} and {self.hold_frames:g}"
+                f"{self.straight:g} and {self.hold_frames:g}",
+                code="out-of-range",
             )
 
     def on(self, correction: str) -> bool:

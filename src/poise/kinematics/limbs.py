@@ -122,7 +122,9 @@ def limb_of(skeleton: Skeleton, joint: int | str) -> Limb:
             chain.append(j)
     if len(chain) < 3:
         raise PoiseError(
-            f"joint '{skeleton.names[end]}' has no two bones above it", skeleton.source.path
+            f"joint '{skeleton.names[end]}' has no two bones above it",
+            skeleton.source.path,
+            code="limb-too-short",
         )
     return Limb(chain[2], chain[1], chain[0])
 

@@ -96,7 +96,7 @@ def place_on_body(
     timed = made if rate_hz is None else resample(made, rate_hz)
     qpos = clip_to_qpos(timed, table)
     if not np.isfinite(qpos).all():
-        raise PoiseError("its coordinates are not finite", clip.name)
+        raise PoiseError("its coordinates are not finite", clip.name, code="not-finite")
     error = joint_error(moved if rate_hz is None else resample(moved, rate_hz), qpos, table)
     qpos = qpos if near is None else within_turns(qpos, near)
     qpos, cycle = _join(qpos, table) if join and clip.cyclic else (qpos, None)

@@ -92,19 +92,19 @@ def read_supports(path: Path) -> tuple[Support, ...]:
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
     except OSError as problem:
-        raise PoiseError(f"cannot be read: {problem.strerror}", path) from None
+        raise PoiseError(f"cannot be read: {problem.strerror}", path, code="file-unreadable") from None
     except (ValueError, RecursionError) as problem:
-        raise PoiseError(f"is no JSON: {str(problem)[:80]}", path) from None
+        raise PoiseError(f"is no JSON: {str(problem)[:80]}", path, code="bad-json") from None
     rows = held if isinstance(held, list) else [held]
     if not rows or len(rows) > 500:
-        raise PoiseError(f"holds {len(rows)} supports; there can be 1 to 500", path)
+        raise PoiseError(f"holds {len(rows)} supports; there can be 1 to 500", path, code="out-of-range")
     return tuple(_support(row, path, k) for k, row in enumerate(cast("list[Any]", rows), 1))
 
 
 def _support(row: Any, path: Path, number: int) -> Support:
     def wrong(what: str) -> PoiseError:
         hint = 'Such as {"kind": "seat", "size": [0.45, 0.45, 0.45], "pos": [0, 0, 0.225]}'
-        return PoiseError(f"support {number}: {what}", path, hint)
+        return PoiseError(f"support {number}: {what}", path, hint, code="bad-support")
 
     if not isinstance(row, dict):
         raise wrong("is no object")

@@ -139,11 +139,19 @@ class AmpConfig:
         validate(self)
         for name in ("frames", "lr", "steps", "minibatch", "kept"):
             if not getattr(self, name) > 0:
-                raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "AmpConfig")
+                raise PoiseError(
+                    f"{name} must be above 0, got {getattr(self, name)}",
+                    "AmpConfig",
+                    code="out-of-range",
+                )
         if not self.shape > 0:
-            raise PoiseError(f"shape must be above 0, got {self.shape:g}", "AmpConfig")
+            raise PoiseError(
+                f"shape must be above 0, got {self.shape:g}", "AmpConfig", code="out-of-range"
+            )
         if not 0 <= self.keep <= 1:
-            raise PoiseError(f"keep must lie in [0, 1], got {self.keep}", "AmpConfig")
+            raise PoiseError(
+                f"keep must lie in [0, 1], got {self.keep}", "AmpConfig", code="out-of-range"
+            )
 
     @classmethod
     def compliant(cls, few: bool = True, product: bool = True) -> AmpConfig:
@@ -320,6 +328,7 @@ class Amp:
             raise TrainingError(
                 "the discriminator became infinite or not a number in the update",
                 hint="The weights before it are kept; lower AmpConfig.lr",
+                code="training-diverged",
             )
         with shared_statistics(self.comm, net.norm):
             for x in (agent, self._some(demos, len(agent))):
@@ -367,6 +376,7 @@ class Amp:
             raise PoiseError(
                 f"the demos have the shape {tuple(drawn.shape)} where ({count}, {width}) is expected",
                 hint="A demo is frames x features of the environment, oldest frame first",
+                code="wrong-shape",
             )
         return drawn.reshape(count, width).to(device)
 

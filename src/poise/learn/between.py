@@ -53,7 +53,9 @@ class BetweenConfig:
     def __post_init__(self) -> None:
         if self.width % self.heads or min(self.width, self.layers, self.heads) < 1:
             raise PoiseError(
-                f"width must be a multiple of heads, got {self.width} and {self.heads}", "BetweenConfig"
+                f"width must be a multiple of heads, got {self.width} and {self.heads}",
+                "BetweenConfig",
+                code="not-a-multiple",
             )
 
 
@@ -112,7 +114,7 @@ def neighbours(known: Tensor) -> Neighbours:
         PoiseError: no frame is known.
     """
     if not bool(known.any()):
-        raise PoiseError("at least one frame must be known")
+        raise PoiseError("at least one frame must be known", code="no-known-frame")
     t = torch.arange(len(known), device=known.device)
     none = torch.full_like(t, -1)
     before = torch.where(known, t, none).cummax(0).values

@@ -47,7 +47,10 @@ def save_checkpoint(path: str | Path, tensors: Mapping[str, Tensor], meta: Mappi
         write_atomic(path, data)
     except OSError as error:
         raise PoiseError(
-            f"the checkpoint could not be written ({error.strerror})", path, "Check the disk"
+            f"the checkpoint could not be written ({error.strerror})",
+            path,
+            "Check the disk",
+            code="cannot-write",
         ) from error
 
 
@@ -67,10 +70,16 @@ def load_checkpoint(
         data = path.read_bytes()
     except OSError as error:
         raise PoiseError(
-            f"the checkpoint could not be read ({error.strerror})", path, "Check the path"
+            f"the checkpoint could not be read ({error.strerror})",
+            path,
+            "Check the path",
+            code="file-unreadable",
         ) from error
     damaged = PoiseError(
-        "the file is damaged or no checkpoint of Poise", path, "Use another checkpoint or train again"
+        "the file is damaged or no checkpoint of Poise",
+        path,
+        "Use another checkpoint or train again",
+        code="file-damaged",
     )
     try:
         size = int.from_bytes(data[:8], "little")
@@ -84,6 +93,7 @@ def load_checkpoint(
             f"this version, {__version__}, reads format {FORMAT}",
             path,
             "Install the version that wrote it, or train again",
+            code="version-differs",
         )
     try:
         # Clones own aligned memory, where views into the file's bytes would not.
@@ -113,6 +123,7 @@ def check_fits(meta: Mapping[str, Any], path: str | Path | None = None, **expect
             words.get(name, f"the checkpoint was made with {name} = {found}, not {want}"),
             path,
             "Use the settings it was made with, or start a new run in another folder",
+            code="checkpoint-unfit",
         )
 
 
@@ -245,7 +256,9 @@ def take(state: Mapping[str, Tensor], name: str) -> Tensor:
     """One tensor of a state, or a `PoiseError` that names it."""
     if name not in state:
         raise PoiseError(
-            f"the saved state has no '{name}'", hint="Another kind of run saved it; start a new one"
+            f"the saved state has no '{name}'",
+            hint="Another kind of run saved it; start a new one",
+            code="state-differs",
         )
     return state[name]
 
@@ -260,6 +273,7 @@ def load_module(module: nn.Module, state: Mapping[str, Tensor], name: str) -> No
         raise PoiseError(
             f"'{name}/{key}' {found} in the saved state where {tuple(value.shape)} is expected",
             hint="Use the layer sizes and the environment with which the state was saved",
+            code="state-differs",
         )
     with torch.no_grad():
         for key, value in own.items():
@@ -282,7 +296,9 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, T
     rates, hint = take(state, "lr"), "Use the layer sizes with which the state was saved"
     if rates.shape != (len(optimizer.param_groups),):
         raise PoiseError(
-            f"the saved optimiser has learning rates of shape {tuple(rates.shape)}", hint=hint
+            f"the saved optimiser has learning rates of shape {tuple(rates.shape)}",
+            hint=hint,
+            code="state-differs",
         )
     for group, lr in zip(optimizer.param_groups, rates.tolist(), strict=True):
         group["lr"] = lr
@@ -294,7 +310,9 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, T
             # A moment is as its parameter, the count of steps a number.
             if value.shape != p.shape and (name != "step" or value.numel() != 1):
                 what = f"the saved optimiser's '{i}/{name}' has the shape {tuple(value.shape)}"
-                raise PoiseError(f"{what} where {tuple(p.shape)} is expected", hint=hint)
+                raise PoiseError(
+                    f"{what} where {tuple(p.shape)} is expected", hint=hint, code="state-differs"
+                )
         if moments:
             optimizer.state[p] = {k: v.to(p.device) for k, v in moments.items()}
 
@@ -350,7 +368,9 @@ def only_writer(folder: Path) -> Generator[None]:
             except BlockingIOError:
                 if time.monotonic() > end:
                     hint = "Wait until it ends, or choose another folder"
-                    raise PoiseError("another training writes here", folder, hint) from None
+                    raise PoiseError(
+                        "another training writes here", folder, hint, code="folder-in-use"
+                    ) from None
                 time.sleep(_POLL_S)
             except OSError:
                 break

@@ -63,12 +63,15 @@ class CloneConfig:
         ):
             if getattr(self, name) < least:
                 raise PoiseError(
-                    f"{name} must be at least {least}, got {getattr(self, name)}", "CloneConfig"
+                    f"{name} must be at least {least}, got {getattr(self, name)}",
+                    "CloneConfig",
+                    code="out-of-range",
                 )
         if not 0 <= self.beta <= 1 or not self.noise or min(self.noise) < 0 or self.lr <= 0:
             raise PoiseError(
                 "beta must lie in [0, 1], lr above 0, and noise needs levels of at least 0",
                 "CloneConfig",
+                code="out-of-range",
             )
 
 
@@ -164,7 +167,7 @@ class _Fitter:
     def fit(self, epochs: int) -> float:
         """Some passes over everything; the loss of the last one."""
         if not self.size:
-            raise TrainingError("the teacher knew in no state what to do")
+            raise TrainingError("the teacher knew in no state what to do", code="teacher-knows-nothing")
         policy, norm = self.actor.policy, self.actor.norm
         norm.freeze()
         scale = (-policy.action_log_std.detach()).exp()
@@ -188,7 +191,11 @@ class _Fitter:
                 total += loss.detach()
             mean = float(total) / parts
             if not mean < float("inf"):
-                raise TrainingError("the loss of cloning is not finite", hint="Lower CloneConfig.lr")
+                raise TrainingError(
+                    "the loss of cloning is not finite",
+                    hint="Lower CloneConfig.lr",
+                    code="training-diverged",
+                )
         return mean
 
 
@@ -275,7 +282,7 @@ class LessonConfig:
         validate(self)
         if min(self.kept, self.batches, self.batch) < 1 or min(self.lr, self.grad_norm) <= 0:
             what = "kept, batches and batch must be at least 1, lr and grad_norm above 0"
-            raise PoiseError(what, "LessonConfig")
+            raise PoiseError(what, "LessonConfig", code="out-of-range")
 
 
 class Student:
@@ -318,7 +325,11 @@ class Student:
             self._adam.step()
             total += float(loss.detach()) / c.batches
         if not total < float("inf"):
-            raise TrainingError("the loss of the lessons is not finite", hint="Lower LessonConfig.lr")
+            raise TrainingError(
+                "the loss of the lessons is not finite",
+                hint="Lower LessonConfig.lr",
+                code="training-diverged",
+            )
         return {"lesson_loss": total, "labels": float(len(obs)), **log}
 
     @torch.no_grad()

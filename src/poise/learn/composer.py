@@ -82,20 +82,29 @@ class Composer(GaussianPolicy):
         count = len(primitives)
         if combine not in ("product", "means"):
             raise PoiseError(
-                f"primitives cannot be combined by '{combine}'", hint="Use product or means"
+                f"primitives cannot be combined by '{combine}'",
+                hint="Use product or means",
+                code="unknown-choice",
             )
         if weights not in _WEIGHTS or (combine == "product" and weights == "silu"):
             names = ", ".join(k for k in _WEIGHTS if combine == "means" or k != "silu")
             hint = f"Use one of {names}"
-            raise PoiseError(f"the weights of a {combine} cannot be made by '{weights}'", hint=hint)
+            raise PoiseError(
+                f"the weights of a {combine} cannot be made by '{weights}'",
+                hint=hint,
+                code="unknown-choice",
+            )
         if joint and combine == "means":
             raise PoiseError(
                 "primitives cannot learn while their means are only weighed",
                 hint="Combine them as a product, from which actions are drawn",
+                code="settings-conflict",
             )
         if log_std.shape != (count, primitives.num_out):
             want = (count, primitives.num_out)
-            raise PoiseError(f"log_std must have the shape {want}, got {tuple(log_std.shape)}")
+            raise PoiseError(
+                f"log_std must have the shape {want}, got {tuple(log_std.shape)}", code="wrong-shape"
+            )
         scores = MLP(primitives.num_in, hidden, count, activation, last_scale=0.1, generator=generator)
         super().__init__(scores, std, learn_std)
         self.primitives, self.combine, self.weights, self.joint = primitives, combine, weights, joint

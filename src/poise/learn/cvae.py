@@ -46,7 +46,9 @@ class CVAEConfig:
         validate(self)
         sizes = (self.past, self.future, self.latent, self.hidden, self.cosines, self.blocks)
         if min(*sizes, *self.layers) < 1 or self.past < 2:
-            raise PoiseError("every size must be at least 1, and the past 2 frames", "CVAEConfig")
+            raise PoiseError(
+                "every size must be at least 1, and the past 2 frames", "CVAEConfig", code="out-of-range"
+            )
 
 
 class Code(NamedTuple):
@@ -349,7 +351,9 @@ class CVAETraining:
         above = (self.batch, self.lr, self.beta, self.settle, self.segments, self.grad_norm)
         if min(above) <= 0:
             raise PoiseError(
-                "batch, lr, beta, settle, segments and grad_norm must be above 0", "CVAETraining"
+                "batch, lr, beta, settle, segments and grad_norm must be above 0",
+                "CVAETraining",
+                code="out-of-range",
             )
 
     @classmethod
@@ -397,7 +401,9 @@ class Frames:
         usable = (self.room >= window).nonzero()[:, 0]
         if not len(usable):
             raise PoiseError(
-                f"no clip has {window} frames in a row", hint="Give longer clips, or see fewer frames"
+                f"no clip has {window} frames in a row",
+                hint="Give longer clips, or see fewer frames",
+                code="clip-too-short",
             )
         if self.weights is None:
             return usable[torch.randint(len(usable), (count,), generator=generator)]

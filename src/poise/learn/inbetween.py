@@ -105,7 +105,10 @@ class InbetweenTrainer:
         metadata: Mapping[str, Any] | None = None,
     ):
         if min(steps, batch, block) < 1 or not 0 <= ema < 1:
-            raise PoiseError(f"steps, batch and block must be at least 1 and ema in [0, 1), got {ema}")
+            raise PoiseError(
+                f"steps, batch and block must be at least 1 and ema in [0, 1), got {ema}",
+                code="out-of-range",
+            )
         self.objective, self.sampler = objective, sampler
         self.steps, self.batch, self.block, self.ema = steps, batch, block, ema
         self.metadata, self.seed = dict(metadata or {}), seed
@@ -137,7 +140,11 @@ class InbetweenTrainer:
             self.step += 1
         parts = {k: float(v) / counts[k] for k, v in sums.items()}
         if not math.isfinite(parts.get("loss", 0.0)):
-            raise TrainingError(f"the loss at step {self.step} is not finite", hint="Lower the lr")
+            raise TrainingError(
+                f"the loss at step {self.step} is not finite",
+                hint="Lower the lr",
+                code="training-diverged",
+            )
         seconds = time.perf_counter() - begun
         self.seconds += seconds
         rate = count * self.batch / max(seconds, 1e-9)
@@ -189,12 +196,14 @@ class InbetweenTrainer:
         """
         tensors, meta = load_checkpoint(path)
         if meta.get("kind") != "inbetween trainer":
-            raise PoiseError("the checkpoint is of another kind of training", path)
+            raise PoiseError(
+                "the checkpoint is of another kind of training", path, code="wrong-file-kind"
+            )
         same = (meta["steps"], meta["seed"]) == (self.steps, self.seed)
         if not same or meta["metadata"] != self.metadata:
             raise PoiseError(
                 "the checkpoint was made with other settings or another training set", path,
-                "Resume it as it is or choose another folder",
+                "Resume it as it is or choose another folder", code="settings-differ",
             )  # fmt: skip
         self.load_state(tensors)
         return meta
@@ -305,7 +314,11 @@ def make_net(kind: str, layout: Layout, config: BetweenConfig | RTNConfig, seed:
         return Between(layout, config, generator=generator)
     if kind == "rtn" and isinstance(config, RTNConfig):
         return RTN(layout, config, generator=generator)
-    raise PoiseError(f"there is no in-betweening network '{kind}' of such sizes", hint=f"Known: {KINDS}")
+    raise PoiseError(
+        f"there is no in-betweening network '{kind}' of such sizes",
+        hint=f"Known: {KINDS}",
+        code="unknown-choice",
+    )
 
 
 def save_model(path: Path, model: InbetweenModel, half: bool = False) -> None:
@@ -333,14 +346,16 @@ def load_model(path: Path) -> InbetweenModel:
     path = path / MODEL if path.is_dir() else path
     if not path.exists():
         hint = "Train one with poise train inbetween"
-        raise PoiseError("there is no in-betweening model", path, hint)
+        raise PoiseError("there is no in-betweening model", path, hint, code="file-missing")
     tensors, meta = load_checkpoint(path)
     if meta.get("kind") != "inbetween model":
-        raise PoiseError("the file is not an in-betweening model", path)
+        raise PoiseError("the file is not an in-betweening model", path, code="wrong-file-kind")
     check_data(ModelMeta, meta, path)
     hint = "Train it again"
     if not (meta["fps"] > 0 and min(meta["longest"], meta["past"]) > 0):
-        raise PoiseError("its rate and the lengths that it fills must be above 0", path, hint)
+        raise PoiseError(
+            "its rate and the lengths that it fills must be above 0", path, hint, code="file-damaged"
+        )
     try:
         said = meta["layout"]
         layout = Layout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
@@ -361,9 +376,13 @@ def load_model(path: Path) -> InbetweenModel:
             meta["longest"], meta["past"], meta["meta"], example,
         )  # fmt: skip
     except PoiseError as problem:
-        raise PoiseError(problem.what, problem.where or path, problem.hint or hint) from None
+        raise PoiseError(
+            problem.what, problem.where or path, problem.hint or hint, code=problem.code
+        ) from None
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as problem:
-        raise PoiseError(f"the model is of another version ({problem})", path, hint) from None
+        raise PoiseError(
+            f"the model is of another version ({problem})", path, hint, code="version-differs"
+        ) from None
 
 
 def _check_sizes(sizes: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -373,7 +392,11 @@ def _check_sizes(sizes: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
         numbers = cast("Sequence[Any]", value) if isinstance(value, list | tuple) else (value,)
         for number in numbers:
             if isinstance(number, int) and not 0 <= number <= held:
-                raise PoiseError(f"its weights are not those of a network with {name} = {value}", path)
+                raise PoiseError(
+                    f"its weights are not those of a network with {name} = {value}",
+                    path,
+                    code="weights-unfit",
+                )
 
 
 N = TypeVar("N", bound=nn.Module)
@@ -402,7 +425,8 @@ class Adaptation:
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
             raise PoiseError(
-                f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}"
+                f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}",
+                code="out-of-range",
             )
         validate(self)
 
@@ -481,5 +505,7 @@ def adapt(
 
 def _stepped(optimizer: torch.optim.Optimizer, loss: float) -> None:
     if not loss < float("inf"):
-        raise TrainingError("the loss of the adaptation is not finite", hint="Lower its lr")
+        raise TrainingError(
+            "the loss of the adaptation is not finite", hint="Lower its lr", code="training-diverged"
+        )
     optimizer.step()

@@ -52,11 +52,22 @@ class MiningConfig:
         validate(self)
         for name in ("floor", "fade"):
             if not 0 <= getattr(self, name) <= 1:
-                raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "MiningConfig")
+                raise PoiseError(
+                    f"{name} must lie in [0, 1], got {getattr(self, name)}",
+                    "MiningConfig",
+                    code="out-of-range",
+                )
         if self.rule == "floor" and self.floor == 0:
-            raise PoiseError("a floor of 0 is the rule soft", "MiningConfig", "Use soft, or a floor")
+            raise PoiseError(
+                "a floor of 0 is the rule soft",
+                "MiningConfig",
+                "Use soft, or a floor",
+                code="settings-conflict",
+            )
         if self.memory < 1:
-            raise PoiseError(f"memory must be at least 1, got {self.memory}", "MiningConfig")
+            raise PoiseError(
+                f"memory must be at least 1, got {self.memory}", "MiningConfig", code="out-of-range"
+            )
 
     @classmethod
     def phc(cls, faithful: Literal["paper", "code"] = "paper") -> MiningConfig:
@@ -87,7 +98,7 @@ class HardNegatives:
         self.config = config or MiningConfig()
         self.base = torch.ones(clips, dtype=torch.float64) if base is None else base.double().cpu()
         if clips < 1 or self.base.shape != (clips,) or not bool((self.base > 0).all()):
-            raise PoiseError(f"mining needs odds above 0 for each of {clips} clips")
+            raise PoiseError(f"mining needs odds above 0 for each of {clips} clips", code="bad-weights")
         self.member = torch.ones(clips, dtype=torch.bool)
         self.tried = torch.zeros(clips, dtype=torch.int64)
         self.failed = torch.zeros(clips, dtype=torch.int64)
@@ -106,7 +117,10 @@ class HardNegatives:
         succeeded = succeeded.bool().cpu()
         known = torch.ones(clips, dtype=torch.bool) if evaluated is None else evaluated.bool().cpu()
         if succeeded.shape != (clips,) or known.shape != (clips,):
-            raise PoiseError(f"an evaluation of {clips} clips has the shape {tuple(succeeded.shape)}")
+            raise PoiseError(
+                f"an evaluation of {clips} clips has the shape {tuple(succeeded.shape)}",
+                code="wrong-shape",
+            )
         failed = known & ~succeeded
         self.tried += known
         self.failed += failed
@@ -151,7 +165,10 @@ class HardNegatives:
         """
         member = self.hard if member is None else member.bool().cpu()
         if member.shape != self.member.shape:
-            raise PoiseError(f"a stage of {len(self.member)} clips has the shape {tuple(member.shape)}")
+            raise PoiseError(
+                f"a stage of {len(self.member)} clips has the shape {tuple(member.shape)}",
+                code="wrong-shape",
+            )
         left = int(member.sum())
         if left:
             self.member = member.clone()
@@ -173,6 +190,7 @@ class HardNegatives:
             raise PoiseError(
                 f"the saved state is of {len(saved)} clips, the library has {len(self.member)}",
                 hint="Resume with the library it was saved with",
+                code="state-differs",
             )
         for name in ("member", "tried", "failed", "faded"):
             setattr(self, name, take(state, name).clone())
@@ -198,7 +216,7 @@ class ConvergenceConfig:
 
     def __post_init__(self) -> None:
         if self.patience < 1 or self.least < 1 or (self.most is not None and self.most < self.least):
-            raise PoiseError(f"a stage cannot end by {self}", "ConvergenceConfig")
+            raise PoiseError(f"a stage cannot end by {self}", "ConvergenceConfig", code="out-of-range")
 
 
 class Convergence:
@@ -219,7 +237,7 @@ class Convergence:
         gained, such as help that was taken away, so that the stage's patience begins anew.
         """
         if not 0 <= succeeded <= total:
-            raise PoiseError(f"{succeeded} of {total} clips cannot have succeeded")
+            raise PoiseError(f"{succeeded} of {total} clips cannot have succeeded", code="out-of-range")
         self.evaluations += 1
         rate = succeeded / total if total else 1.0
         if rate > self.best + self.config.gain or self.evaluations == 1:

@@ -85,10 +85,13 @@ class MLP(nn.Module):
             raise PoiseError(
                 f"there is no activation '{activation}'",
                 hint=did_you_mean(activation, list(ACTIVATIONS)),
+                code="unknown-choice",
             )
         sizes = [num_in, *hidden, num_out]
         if min(sizes) < 1:
-            raise PoiseError(f"every layer needs at least 1 unit, got the sizes {sizes}")
+            raise PoiseError(
+                f"every layer needs at least 1 unit, got the sizes {sizes}", code="out-of-range"
+            )
         layers: list[nn.Module] = []
         for i, (a, b) in enumerate(pairwise(sizes)):
             linear = bare_linear(a, b)
@@ -254,7 +257,9 @@ class ProgressiveNet(nn.Module):
         self.num_in, self.num_out, self.lateral = num_in, num_out, lateral
         self.hidden, self.activation = tuple(hidden), activation
         if lateral and not self.hidden:
-            raise PoiseError("lateral connections need at least one hidden layer")
+            raise PoiseError(
+                "lateral connections need at least one hidden layer", code="settings-conflict"
+            )
         # Row k: log sigma with which the frozen column k was trained; the policy holds the last one's.
         self.register_buffer("log_std", torch.zeros(0, num_out))
         self.columns = nn.ModuleList()
@@ -284,7 +289,9 @@ class ProgressiveNet(nn.Module):
             generator: source of random weights.
         """
         if start not in ("copy", "random"):
-            raise PoiseError(f"a column cannot start as '{start}'", hint="Use copy or random")
+            raise PoiseError(
+                f"a column cannot start as '{start}'", hint="Use copy or random", code="unknown-choice"
+            )
         last = len(self) - 1
         self.requires_grad_(False)
         self._append(generator)
@@ -304,7 +311,7 @@ class ProgressiveNet(nn.Module):
     def keep(self, count: int) -> None:
         """Drops the columns after the first `count`; the last one left is as frozen as it was."""
         if not 1 <= count <= len(self):
-            raise PoiseError(f"{count} of {len(self)} columns cannot be kept")
+            raise PoiseError(f"{count} of {len(self)} columns cannot be kept", code="out-of-range")
         self.columns, self.laterals = self.columns[:count], self.laterals[:count]
         self.log_std = self.log_std[:count].clone()
 
@@ -414,7 +421,8 @@ class GaussianPolicy(nn.Module):
         if len(stds) not in (1, mean.num_out) or not bool((stds > 0).all()):
             raise PoiseError(
                 f"the action noise must be one positive number or one for each of the {mean.num_out} "
-                f"actions, got {std}"
+                f"actions, got {std}",
+                code="out-of-range",
             )
         self.mean = mean
         log_std = stds.expand(mean.num_out).log().float().clone()

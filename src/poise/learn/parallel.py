@@ -87,7 +87,9 @@ def joined() -> Iterator[Comm]:
         where = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
         reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
         hint = "Start all processes with torchrun, and the same --nnodes and --rdzv-endpoint everywhere"
-        raise PoiseError(f"the processes did not find each other ({reason})", where, hint) from None
+        raise PoiseError(
+            f"the processes did not find each other ({reason})", where, hint, code="no-answer"
+        ) from None
     try:
         local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
         yield Comm(dist.get_rank(), dist.get_world_size(), local)
@@ -117,6 +119,7 @@ def share_of(total: int, comm: Comm) -> int:
         raise PoiseError(
             f"{total} environments cannot be dealt out evenly to {comm.size} processes",
             hint=f"Use --envs {fits}",
+            code="not-a-multiple",
         )
     return total // comm.size
 
@@ -208,7 +211,8 @@ def together(comm: Comm, error: type[PoiseError] = PoiseError) -> Iterator[None]
             raise problem
         rank, text = next(((r, t) for r, t in enumerate(said) if t), (None, b""))
         lost = "another process" if rank is None else f"process {rank}"
-        raise error(f"{lost} stopped" + (f" ({text.decode()})" if text else ""))
+        because = f" ({text.decode()})" if text else ""
+        raise error(f"{lost} stopped{because}", code="process-stopped")
 
 
 def gather_state(comm: Comm, state: State) -> State:

@@ -80,6 +80,7 @@ class PolicyBundle:
             raise PoiseError(
                 f"a policy of the kind '{kind}' is unknown",
                 hint="Use the version of Poise that saved it",
+                code="unknown-choice",
             )
         lateral = shape["lateral"]
         net = ProgressiveNet(num_obs, hidden, num_actions, activation, lateral, generator=rng)
@@ -289,17 +290,24 @@ def policy_in(tensors: Mapping[str, Tensor], meta: Mapping[str, Any], path: str 
     # What is stated is compared with what is there before networks of that size are made.
     if min(*sizes, need) < 1 or need > sum(v.numel() for v in own.values()):
         raise PoiseError(
-            f"its weights are not those of layers {' x '.join(map(str, sizes))}", path, hint
+            f"its weights are not those of layers {' x '.join(map(str, sizes))}",
+            path,
+            hint,
+            code="weights-unfit",
         )
     try:
         bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], shape)
         bundle.load_state(own)
     except PoiseError as problem:
-        raise PoiseError(problem.what, path, problem.hint or hint) from None
+        raise PoiseError(problem.what, path, problem.hint or hint, code=problem.code) from None
     except (KeyError, TypeError, ValueError, RuntimeError) as problem:
-        raise PoiseError(f"its policy cannot be rebuilt ({problem})", path, hint) from None
+        raise PoiseError(
+            f"its policy cannot be rebuilt ({problem})", path, hint, code="file-damaged"
+        ) from None
     bad = [k for k, v in own.items() if v.is_floating_point() and not bool(v.isfinite().all())]
     if bad:
-        raise PoiseError(f"'{bad[0]}' holds values that are no finite numbers", path, hint)
+        raise PoiseError(
+            f"'{bad[0]}' holds values that are no finite numbers", path, hint, code="not-finite"
+        )
     bundle.meta = dict(meta)
     return bundle

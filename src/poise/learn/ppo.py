@@ -126,17 +126,35 @@ class PPOConfig:
         validate(self)
         for name in ("horizon", "epochs", "minibatch", "policy_lr", "value_lr", "clip"):
             if not getattr(self, name) > 0:
-                raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "PPOConfig")
+                raise PoiseError(
+                    f"{name} must be above 0, got {getattr(self, name)}",
+                    "PPOConfig",
+                    code="out-of-range",
+                )
         for name in ("smooth_weight", "smooth_noise"):
             if not getattr(self, name) >= 0:
-                raise PoiseError(f"{name} must be at least 0, got {getattr(self, name)}", "PPOConfig")
+                raise PoiseError(
+                    f"{name} must be at least 0, got {getattr(self, name)}",
+                    "PPOConfig",
+                    code="out-of-range",
+                )
         if self.smooth_over is not None and not 0 <= self.smooth_over[0] < self.smooth_over[1]:
-            raise PoiseError(f"smooth_over must be (from, to), got {self.smooth_over}", "PPOConfig")
+            raise PoiseError(
+                f"smooth_over must be (from, to), got {self.smooth_over}", "PPOConfig", code="not-rising"
+            )
         for name in ("gamma", "lam"):
             if not 0 <= getattr(self, name) <= 1:
-                raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "PPOConfig")
+                raise PoiseError(
+                    f"{name} must lie in [0, 1], got {getattr(self, name)}",
+                    "PPOConfig",
+                    code="out-of-range",
+                )
         if not 0 < self.lr_range[0] <= self.lr_range[1]:
-            raise PoiseError(f"lr_range must be (low, high) above 0, got {self.lr_range}", "PPOConfig")
+            raise PoiseError(
+                f"lr_range must be (low, high) above 0, got {self.lr_range}",
+                "PPOConfig",
+                code="out-of-range",
+            )
 
     def check_columns(self, num_obs: int) -> None:
         """Whether `smooth_over` names columns that `num_obs` observations have.
@@ -145,7 +163,10 @@ class PPOConfig:
             PoiseError: it ends beyond them.
         """
         if self.smooth_over is not None and self.smooth_over[1] > num_obs:
-            raise PoiseError(f"smooth_over ends at {self.smooth_over[1]} of {num_obs} observations")
+            raise PoiseError(
+                f"smooth_over ends at {self.smooth_over[1]} of {num_obs} observations",
+                code="index-outside",
+            )
 
     @classmethod
     def paper(cls, num_envs: int = 512, faithful: Literal["paper", "code"] = "paper") -> PPOConfig:
@@ -334,7 +355,10 @@ class PPO:
         else:
             found, want = (actor.num_obs, actor.num_actions), (num_obs, num_actions)
             if found != want:
-                raise PoiseError(f"the policy has {found} observations and actions, the task {want}")
+                raise PoiseError(
+                    f"the policy has {found} observations and actions, the task {want}",
+                    code="policy-unfit",
+                )
             self.actor = actor.copy()
         self.critic = MLP(num_obs, config.value_hidden, 1, config.activation, generator=init).to(device)
         self.return_norm = RunningNorm(1, clip=math.inf).to(device)
@@ -576,6 +600,7 @@ class PPO:
             raise TrainingError(
                 f"the {' and the '.join(bad)} became infinite or not a number in the update",
                 hint="The weights before it are kept; lower policy_lr or value_lr, or bound the reward",
+                code="training-diverged",
             )
 
     def state(self) -> State:

@@ -47,7 +47,9 @@ def columns_of(bundle: PolicyBundle, lateral: bool = False) -> PolicyBundle:
     """A trained perceptron, such as a cloned one, as the first primitive; acts as before."""
     mean = bundle.policy.mean
     if not isinstance(mean, MLP) or isinstance(bundle.policy, Composer):
-        raise PoiseError("only a single perceptron can become the first primitive")
+        raise PoiseError(
+            "only a single perceptron can become the first primitive", code="policy-of-primitives"
+        )
     rng = torch.Generator().manual_seed(0)
     hidden = tuple(bundle.shape["hidden"])
     net = ProgressiveNet(
@@ -75,7 +77,7 @@ def primitive(bundle: PolicyBundle, k: int) -> PolicyBundle:
     """Primitive k of columns or of a composer as a policy of its own, to be evaluated."""
     net = _columns(bundle).copy()
     if not 0 <= k < len(net):
-        raise PoiseError(f"there is no primitive {k} among {len(net)}")
+        raise PoiseError(f"there is no primitive {k} among {len(net)}", code="index-outside")
     net.keep(k + 1)
     return _with_net(bundle, net, primitive_log_std(bundle)[k])
 
@@ -136,7 +138,9 @@ def _columns(bundle: PolicyBundle) -> ProgressiveNet:
     policy = bundle.policy
     net = policy.primitives if isinstance(policy, Composer) else policy.mean
     if not isinstance(net, ProgressiveNet):
-        raise PoiseError("the policy has no primitives", hint="Make it one with columns_of")
+        raise PoiseError(
+            "the policy has no primitives", hint="Make it one with columns_of", code="no-primitives"
+        )
     return net
 
 

@@ -38,6 +38,7 @@ def check_finite(name: str, x: Tensor, log: Mapping[str, float] | None = None) -
         f"the {name} is not finite{named}",
         f"environment row {row}{place}",
         "The simulation or a term has diverged there; the weights are those of the last good iteration",
+        code="training-diverged",
     )
 
 

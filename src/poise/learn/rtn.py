@@ -46,7 +46,7 @@ class RTNConfig:
 
     def __post_init__(self) -> None:
         if min(self.hidden, *self.encoder, *self.decoder, self.past, self.longest) < 1:
-            raise PoiseError("every size must be at least 1", "RTNConfig")
+            raise PoiseError("every size must be at least 1", "RTNConfig", code="out-of-range")
 
     @property
     def latest(self) -> int:

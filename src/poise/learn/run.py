@@ -144,7 +144,9 @@ class Until:
         limits = [x for x in (self.minutes, self.iterations, self.samples) if x is not None]
         if not limits or min(limits) < 0:
             raise PoiseError(
-                f"training needs a limit, got {self}", hint="Give minutes, iterations or samples"
+                f"training needs a limit, got {self}",
+                hint="Give minutes, iterations or samples",
+                code="limit-missing",
             )
 
     def reached(self, trainer: Trainer) -> bool:
@@ -215,7 +217,9 @@ def run(
     rank 0 writes; a wish to stop in one of them stops all after the same iteration.
     """
     if every < 1:
-        raise PoiseError(f"the interval of checkpoints must be at least 1, got {every}")
+        raise PoiseError(
+            f"the interval of checkpoints must be at least 1, got {every}", code="out-of-range"
+        )
     with together(trainer.comm):
         keeper = None if folder is None else _Keeper(trainer, Path(folder), tensorboard)
     stats: IterationStats | None = None

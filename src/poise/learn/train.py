@@ -270,13 +270,16 @@ class Trainer:
         device, state = torch.device(self.env.device), own_state(self.comm, state)
         counters = take(state, "trainer/counters")
         if counters.shape != (6,) or not bool(counters[:3].isfinite().all() & (counters[:3] >= 0).all()):
-            raise PoiseError(f"the saved counters make no sense: {counters.tolist()[:6]}")
+            raise PoiseError(
+                f"the saved counters make no sense: {counters.tolist()[:6]}", code="file-damaged"
+            )
         obs = take(state, "trainer/obs")
         if obs.shape != (self.env.num_envs, self.env.num_obs):
             raise PoiseError(
                 f"the saved state is of {obs.shape[0]} environments with {obs.shape[1]} observations, "
                 f"this run has {self.env.num_envs} with {self.env.num_obs}",
                 hint="Resume with the number of environments and the terms it was saved with",
+                code="state-differs",
             )
         self.ppo.load_state(state)
         if self.style is not None:
@@ -289,7 +292,7 @@ class Trainer:
             why = f"'{problem.args[0]}' is missing" if isinstance(problem, KeyError) else str(problem)
             hint = "The checkpoint is damaged or was changed; go on from another one"
             raise PoiseError(
-                f"the saved state of the worlds cannot be used ({why})", hint=hint
+                f"the saved state of the worlds cannot be used ({why})", hint=hint, code="state-differs"
             ) from problem
         self._obs = obs.to(device, copy=True)
         self.episodes.length.copy_(take(state, "trainer/episode_length"))
@@ -345,11 +348,14 @@ class Trainer:
                 "the checkpoint was trained with a learned style reward, this run has none",
                 path,
                 "Use the settings it was made with, or start a new run in another folder",
+                code="checkpoint-unfit",
             )
         try:
             self.load_state(tensors)
         except PoiseError as problem:
-            raise PoiseError(problem.what, problem.where or path, problem.hint) from problem
+            raise PoiseError(
+                problem.what, problem.where or path, problem.hint, code=problem.code
+            ) from problem
         return meta
 
     def close(self) -> None:

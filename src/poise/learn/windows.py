@@ -72,7 +72,7 @@ class Sampler:
 
     def __init__(self, data: FrameData, stretch: float = 1.0):
         if not 1.0 <= stretch <= 4.0:
-            raise PoiseError(f"stretch must lie in 1 to 4, got {stretch:g}")
+            raise PoiseError(f"stretch must lie in 1 to 4, got {stretch:g}", code="out-of-range")
         self.data, self.stretch = data, stretch
         sizes = data.first[1:] - data.first[:-1]
         clip = torch.repeat_interleave(torch.arange(len(sizes)), sizes)
@@ -95,6 +95,7 @@ class Sampler:
             raise PoiseError(
                 f"no clip of the training set has {window} frames",
                 hint="Give longer clips or train shorter transitions",
+                code="clip-too-short",
             )
         start = self.order[torch.randint(most, (count,), generator=generator)]
         if self.stretch == 1.0:
@@ -138,7 +139,10 @@ class History:
         """One more frame `(N, F)` of every environment."""
         if features.shape != self.frames[:, 0].shape:
             want = tuple(self.frames[:, 0].shape)
-            raise PoiseError(f"the features have the shape {tuple(features.shape)}, {want} is expected")
+            raise PoiseError(
+                f"the features have the shape {tuple(features.shape)}, {want} is expected",
+                code="wrong-shape",
+            )
         self.frames = torch.cat((self.frames[:, 1:], features.unsqueeze(1)), 1)
         self.seen = (self.seen + 1).clamp_max(self.frames.shape[1])
 
@@ -215,6 +219,7 @@ class WindowBuffer:
         if len(data) > self.size or data.shape[1:] != self.data.shape[1:]:
             raise PoiseError(
                 f"the saved buffer holds {tuple(data.shape)}, this one at most "
-                f"{(self.size, self.data.shape[1])}"
+                f"{(self.size, self.data.shape[1])}",
+                code="state-differs",
             )
         self.data, self.next = data.to(self.data.device, copy=True), int(take(state, "next"))

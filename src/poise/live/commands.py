@@ -33,20 +33,20 @@ def parse(text: str | bytes) -> dict[str, Any]:
         PoiseError: too long, too deep, no JSON, no object, or of another version.
     """
     if len(text) > MOST_BYTES:
-        raise PoiseError("too long", "message")
+        raise PoiseError("too long", "message", code="over-limit")
     try:
         words = text.decode("utf-8") if isinstance(text, bytes) else text
     except UnicodeDecodeError:
-        raise PoiseError("no UTF-8", "message") from None
+        raise PoiseError("no UTF-8", "message", code="not-text") from None
     _shallow(words)
     try:
         out = json.loads(words, parse_constant=_none)
     except (ValueError, RecursionError):
-        raise PoiseError("no JSON", "message") from None
+        raise PoiseError("no JSON", "message", code="bad-json") from None
     if not isinstance(out, dict):
-        raise PoiseError("no object", "message")
+        raise PoiseError("no object", "message", code="not-an-object")
     if out.get("v") != VERSION:
-        raise PoiseError("other version", "message", f'Say "v": {VERSION}')
+        raise PoiseError("other version", "message", f'Say "v": {VERSION}', code="version-differs")
     return out
 
 
@@ -62,7 +62,7 @@ def _shallow(text: str) -> None:
         if mark in "[{":
             depth += 1
             if depth > DEPTH:
-                raise PoiseError("too deep", "message")
+                raise PoiseError("too deep", "message", code="nested-too-deep")
         elif mark != '"':
             depth -= 1
 
@@ -70,43 +70,43 @@ def _shallow(text: str) -> None:
 def number(value: Any, low: float = -_MOST, high: float = _MOST) -> float:
     """A finite number within bounds."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise PoiseError("no number", "message")
+        raise PoiseError("no number", "message", code="not-a-number")
     try:
         out = float(value)
     except OverflowError:
-        raise PoiseError("not finite", "message") from None
+        raise PoiseError("not finite", "message", code="not-finite") from None
     if not math.isfinite(out):
-        raise PoiseError("not finite", "message")
+        raise PoiseError("not finite", "message", code="not-finite")
     if not low <= out <= high:
-        raise PoiseError("out of range", "message")
+        raise PoiseError("out of range", "message", code="out-of-range")
     return out
 
 
 def whole(value: Any, high: int = 1024) -> int:
     """A whole number from 0 to `high`."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= high:
-        raise PoiseError("no index", "message")
+        raise PoiseError("no index", "message", code="wrong-type")
     return value
 
 
 def triple(value: Any) -> list[float]:
     """Three numbers."""
     if not isinstance(value, list) or len(value) != 3:
-        raise PoiseError("no point", "message")
+        raise PoiseError("no point", "message", code="wrong-type")
     return [number(v) for v in value]
 
 
 def name(value: Any) -> str:
     """A short word."""
     if not isinstance(value, str) or not 0 < len(value) <= NAME or not value.isprintable():
-        raise PoiseError("no name", "message")
+        raise PoiseError("no name", "message", code="not-a-name")
     return value
 
 
 def flag(value: Any) -> bool:
     """True or false."""
     if not isinstance(value, bool):
-        raise PoiseError("no flag", "message")
+        raise PoiseError("no flag", "message", code="wrong-type")
     return value
 
 
@@ -142,27 +142,27 @@ def command(message: Mapping[str, Any]) -> dict[str, Any]:
     """
     kind = message.get("type")
     if not isinstance(kind, str) or kind not in COMMANDS:
-        raise PoiseError("unknown type", "message")
+        raise PoiseError("unknown type", "message", code="unknown-message")
     fields = COMMANDS[kind]
     given = {k: v for k, v in message.items() if k not in ("v", "type")}
     if given.keys() - fields.keys() or (kind != "set" and fields.keys() - given.keys()):
-        raise PoiseError("other fields", "message")
+        raise PoiseError("other fields", "message", code="fields-differ")
     return {"type": kind, **{k: fields[k](v) for k, v in given.items()}}
 
 
 def numbers(value: Any, width: int, most: int) -> np.ndarray:
     """Rows of `width` numbers, `(n, width)`; NaN and infinity pass, and are refused as a packet."""
     if not isinstance(value, list) or not 0 < len(value) <= most:
-        raise PoiseError("no rows", "message")
+        raise PoiseError("no rows", "message", code="wrong-type")
     for row in value:
         if not isinstance(row, list) or len(row) != width:
-            raise PoiseError("no rows", "message")
+            raise PoiseError("no rows", "message", code="wrong-type")
         if any(isinstance(x, bool) or not isinstance(x, int | float) for x in row):
-            raise PoiseError("no number", "message")
+            raise PoiseError("no number", "message", code="not-a-number")
     try:
         return np.array(value, dtype=float)
     except OverflowError:
-        raise PoiseError("not finite", "message") from None
+        raise PoiseError("not finite", "message", code="not-finite") from None
 
 
 def points_of(message: Mapping[str, Any], count: int) -> np.ndarray:
@@ -173,15 +173,15 @@ def points_of(message: Mapping[str, Any], count: int) -> np.ndarray:
     """
     rows, sure = message.get("points"), message.get("confidence")
     if not isinstance(rows, list) or len(rows) != count:
-        raise PoiseError("other keypoints", "message")
+        raise PoiseError("other keypoints", "message", code="keypoints-differ")
     out = numbers([[math.nan] * 3 if row is None else row for row in rows], 3, JOINTS)
     if sure is not None:
         if not isinstance(sure, list) or len(sure) != count:
-            raise PoiseError("other keypoints", "message")
+            raise PoiseError("other keypoints", "message", code="keypoints-differ")
         out[~(numbers([[c] for c in sure], 1, JOINTS)[:, 0] > 0.0)] = np.nan
     out[~np.isfinite(out).all(-1)] = np.nan
     if np.nanmax(np.abs(out), initial=0.0) > FAR_M:
-        raise PoiseError("too far away", "message")
+        raise PoiseError("too far away", "message", code="too-far")
     return turned(out, vertical(message))
 
 
@@ -193,25 +193,25 @@ def skeleton_of(message: Mapping[str, Any]) -> Skeleton:
     """
     names, parents = message.get("names"), message.get("parents")
     if not isinstance(names, list) or not 0 < len(names) <= JOINTS:
-        raise PoiseError("no names", "message")
+        raise PoiseError("no names", "message", code="bad-skeleton")
     words = tuple(name(n) for n in names)
     if not isinstance(parents, list) or len(parents) != len(words):
-        raise PoiseError("no parents", "message")
+        raise PoiseError("no parents", "message", code="bad-skeleton")
     up = [-1 if p == -1 and not isinstance(p, bool) else whole(p, len(words)) for p in parents]
     offsets = numbers(message.get("offsets"), 3, JOINTS)
     if len(offsets) != len(words) or not np.abs(offsets).max() < 100.0:
-        raise PoiseError("no offsets", "message")
+        raise PoiseError("no offsets", "message", code="bad-skeleton")
     try:
         return Skeleton(words, tuple(up), turned(offsets, vertical(message)))
     except PoiseError:
-        raise PoiseError("no skeleton", "message") from None
+        raise PoiseError("no skeleton", "message", code="bad-skeleton") from None
 
 
 def vertical(message: Mapping[str, Any]) -> str:
     """The message's vertical."""
     up = message.get("up", "Z")
     if up not in UPS:
-        raise PoiseError("no vertical", "message")
+        raise PoiseError("no vertical", "message", code="unknown-axis")
     return str(up)
 
 
@@ -249,11 +249,21 @@ class LiveConfig:
     def __post_init__(self) -> None:
         validate(self)
         if not 1 <= self.characters <= 16:
-            raise PoiseError(f"characters must lie in 1 to 16, got {self.characters}", "LiveConfig")
+            raise PoiseError(
+                f"characters must lie in 1 to 16, got {self.characters}",
+                "LiveConfig",
+                code="out-of-range",
+            )
         if not 0 <= self.buffer_s <= 0.4:
-            raise PoiseError(f"buffer_s must lie in 0 to 0.4 s, got {self.buffer_s:g}", "LiveConfig")
+            raise PoiseError(
+                f"buffer_s must lie in 0 to 0.4 s, got {self.buffer_s:g}",
+                "LiveConfig",
+                code="out-of-range",
+            )
         if not 0 <= self.lookahead <= self.characters:
             what = f"lookahead must lie in 0 to {self.characters} characters, got {self.lookahead}"
-            raise PoiseError(what, "LiveConfig")
+            raise PoiseError(what, "LiveConfig", code="out-of-range")
         if not 0 <= self.noise <= 1:
-            raise PoiseError(f"noise must lie in 0 to 1, got {self.noise:g}", "LiveConfig")
+            raise PoiseError(
+                f"noise must lie in 0 to 1, got {self.noise:g}", "LiveConfig", code="out-of-range"
+            )

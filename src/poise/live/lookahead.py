@@ -64,7 +64,9 @@ def tries_of(tracker: Tracker, config: LookaheadConfig, seed: int) -> Lookahead:
         PoiseError: the policy has no critic.
     """
     if tracker.value is None or tracker.recovery_clips is None:
-        raise PoiseError("the policy was saved without its critic, which lookahead needs")
+        raise PoiseError(
+            "the policy was saved without its critic, which lookahead needs", code="critic-missing"
+        )
     task = imitation_of(tracker, [place(tracker.example, tracker)])
     task = replace(task, task=replace(task.task, help_by="all", compliance=Compliance(level=0.0)))
     out = look_ahead(tracker, task, config, 1, seed)
@@ -183,7 +185,11 @@ class AheadBeside:
         """See `Ahead`."""
         env = self._env
         if env is None:
-            raise PoiseError("a lookahead acts in an environment", hint="Call watch(env) first")
+            raise PoiseError(
+                "a lookahead acts in an environment",
+                hint="Call watch(env) first",
+                code="environment-missing",
+            )
         while not self._told.empty():
             world, told = self._told.get()
             self._waiting = False

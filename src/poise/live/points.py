@@ -74,7 +74,7 @@ class Performer:
         dt = 0.0 if before is None else frame.time_s - before
         whole, stale = self._gaps(frame.points[self._kept], dt)
         if whole is None or stale > STALE_S:
-            raise PoiseError("keypoints are missing", self.person)
+            raise PoiseError("keypoints are missing", self.person, code="keypoints-unseen")
         assert self._whole is not None
         whole, time_s, tremble = self._smoothed(whole, frame.time_s, dt)
         if time_s <= self._fitted:
@@ -110,7 +110,7 @@ class Performer:
     def _measure(self, frame: Frame) -> None:
         seen = self._seen
         if np.isnan(frame.points).all():
-            raise PoiseError("keypoints are missing", self.person)
+            raise PoiseError("keypoints are missing", self.person, code="keypoints-unseen")
         if seen and np.isfinite(apart := _apart(frame.points, seen[0].points)) and apart > STILL_M:
             # A step begins it anew.
             seen.clear()
@@ -123,7 +123,7 @@ class Performer:
         every = np.stack([f.points for f in stood])
         kept = np.flatnonzero(np.isfinite(every).all(-1).mean(0) >= 0.5)
         if not len(kept):
-            raise PoiseError("keypoints are missing", self.person)
+            raise PoiseError("keypoints are missing", self.person, code="keypoints-unseen")
         names, rate = tuple(self.names[k] for k in kept), (len(stood) - 1) / long
         # The body is measured on frames without gaps.
         points = Keypoints(names, hold_missing(every[:, kept]), rate, self.person)
@@ -131,7 +131,9 @@ class Performer:
             body = PointBody.calibrate(points, self._onto, self._table)
             self._whole = fit_clip(points)
         except PoiseError as problem:
-            raise PoiseError("these keypoints show no body", self.person) from problem
+            raise PoiseError(
+                "these keypoints show no body", self.person, code="no-body-shown"
+            ) from problem
         self._body, self.share = body, 1.0
         self._kept, self._gaps, self._steady = kept, Gaps(len(kept), MAX_SPEED), None
 

@@ -102,7 +102,7 @@ class Recorder:
             paths = [self.path.with_name(f"{stem}{more}{s}") for s in (".csv", self.path.suffix)]
             if not any(p.exists() for p in paths):
                 return paths[0]
-        raise PoiseError("ten thousand takes lie there already", self.path)
+        raise PoiseError("ten thousand takes lie there already", self.path, code="over-limit")
 
     def _write(self, waiting: queue.Queue[np.ndarray | None]) -> None:
         files, made, rows, due = list[TextIO](), 0, list[np.ndarray](), time.monotonic() + EVERY_S

@@ -206,7 +206,9 @@ class Listener:
             for door in self.doors:
                 door.close()
             what = f"cannot listen for {asks[0]} on {host}:{port}: {problem.strerror}"
-            raise PoiseError(what, hint=f"Give another {asks[1]} port") from problem
+            raise PoiseError(
+                what, hint=f"Give another {asks[1]} port", code="cannot-listen"
+            ) from problem
         self._stop, self._selector = threading.Event(), selectors.DefaultSelector()
         self._thread = threading.Thread(target=self._listen, daemon=True)
 

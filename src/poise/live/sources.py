@@ -187,16 +187,16 @@ class JsonStream:
         kind, person = message.get("type"), name(message.get("person", "person"))
         if kind == "skeleton":
             if person not in self._skeletons and len(self._skeletons) >= PEOPLE:
-                raise PoiseError("too many people", "message")
+                raise PoiseError("too many people", "message", code="over-limit")
             self._skeletons[person] = skeleton_of(message), vertical(message)
             return
         if kind == "keypoints":
             self._keypoints(message, person, arrived_s)
             return
         if kind != "pose":
-            raise PoiseError("unknown type", "message")
+            raise PoiseError("unknown type", "message", code="unknown-message")
         if person not in self._skeletons:
-            raise PoiseError("no skeleton yet", "message")
+            raise PoiseError("no skeleton yet", "message", code="skeleton-missing")
         skeleton, up = self._skeletons[person]
         time_s = number(message["time"]) if "time" in message else arrived_s
         root = numbers([message.get("root")], 3, 1)[0]
@@ -206,20 +206,20 @@ class JsonStream:
 
     def _keypoints(self, message: Mapping[str, Any], person: str, arrived_s: float) -> None:
         if self._points is None:
-            raise PoiseError("no keypoints here", "message")
+            raise PoiseError("no keypoints here", "message", code="no-keypoints")
         if "names" in message:
             if person not in self._labels and len(self._labels) >= PEOPLE:
-                raise PoiseError("too many people", "message")
+                raise PoiseError("too many people", "message", code="over-limit")
             told = message["names"]
             if not isinstance(told, list) or not 0 < len(told) <= JOINTS:
-                raise PoiseError("no names", "message")
+                raise PoiseError("no names", "message", code="names-missing")
             labels = tuple(name(n) for n in told)
             if len(set(labels)) < len(labels):
-                raise PoiseError("no names", "message")
+                raise PoiseError("no names", "message", code="names-missing")
             self._labels[person] = labels
         labels = self._labels.get(person)
         if labels is None:
-            raise PoiseError("no names yet", "message")
+            raise PoiseError("no names yet", "message", code="names-missing")
         if "points" not in message:
             return
         points = points_of(message, len(labels))

@@ -80,21 +80,21 @@ def checked(packet: Packet) -> Packet:
         PoiseError: numbers that are not finite, rotations that are none, or a place beyond `FAR_M`.
     """
     if packet.root_pos.shape != (3,) or packet.rot.shape != (len(packet.skeleton), 4):
-        raise PoiseError("shape", packet.person)
+        raise PoiseError("shape", packet.person, code="wrong-shape")
     if not np.isfinite(packet.time_s) or not np.isfinite(packet.root_pos).all():
-        raise PoiseError("not finite", packet.person)
+        raise PoiseError("not finite", packet.person, code="not-finite")
     norms = np.linalg.norm(packet.rot, axis=-1)
     if not np.isfinite(norms).all():
-        raise PoiseError("not finite", packet.person)
+        raise PoiseError("not finite", packet.person, code="not-finite")
     if norms.min() < 0.5 or norms.max() > 2.0:
-        raise PoiseError("no rotation", packet.person)
+        raise PoiseError("no rotation", packet.person, code="not-a-rotation")
     places = packet.places
     if places is not None and not np.isfinite(places).all():
-        raise PoiseError("not finite", packet.person)
+        raise PoiseError("not finite", packet.person, code="not-finite")
     if max(np.abs(x).max() for x in (packet.root_pos, places) if x is not None) > FAR_M:
-        raise PoiseError("too far away", packet.person)
+        raise PoiseError("too far away", packet.person, code="too-far")
     if not 0 < len(packet.person) <= NAME:
-        raise PoiseError("name", packet.person[:NAME])
+        raise PoiseError("name", packet.person[:NAME], code="not-a-name")
     return replace(packet, rot=normalized(packet.rot))
 
 

@@ -75,7 +75,7 @@ def skeleton_of(offsets: Mapping[str, np.ndarray]) -> Skeleton:
         PoiseError: a bone that every model has is missing.
     """
     if any(bone not in offsets for bone in NEEDED):
-        raise PoiseError("bones are missing", "VRM")
+        raise PoiseError("bones are missing", "VRM", code="joint-missing")
     names = tuple(bone for bone in PARENTS if bone in offsets)
     parents = list[int]()
     for bone in names:
@@ -126,12 +126,12 @@ def messages(data: bytes) -> list[Message]:
         PoiseError: it is no OSC, or too large, too deep or too long.
     """
     if not data or len(data) > MOST or len(data) % 4:
-        raise PoiseError("no OSC", "datagram")
+        raise PoiseError("no OSC", "datagram", code="not-osc")
     out = list[Message]()
     for message in _parts(data, DEPTH):
         out.append(message)
         if len(out) > MESSAGES:
-            raise PoiseError("too many messages", "datagram")
+            raise PoiseError("too many messages", "datagram", code="over-limit")
     return out
 
 
@@ -140,17 +140,17 @@ def _parts(data: bytes, depth: int) -> Iterator[Message]:
         yield _message(data)
         return
     if depth == 0:
-        raise PoiseError("too deep", "datagram")
+        raise PoiseError("too deep", "datagram", code="nested-too-deep")
     at = 16
     if len(data) < at:
-        raise PoiseError("no OSC", "datagram")
+        raise PoiseError("no OSC", "datagram", code="not-osc")
     while at < len(data):
         if at + 4 > len(data):
-            raise PoiseError("no OSC", "datagram")
+            raise PoiseError("no OSC", "datagram", code="not-osc")
         (size,) = struct.unpack_from(">i", data, at)
         at += 4
         if size <= 0 or size % 4 or at + size > len(data):
-            raise PoiseError("no OSC", "datagram")
+            raise PoiseError("no OSC", "datagram", code="not-osc")
         yield from _parts(data[at : at + size], depth - 1)
         at += size
 
@@ -159,12 +159,12 @@ def _message(data: bytes) -> Message:
     address, at = _word(data, 0)
     tags, at = _word(data, at)
     if not address.startswith("/") or not tags.startswith(",") or len(tags) > ARGUMENTS + 1:
-        raise PoiseError("no OSC", "datagram")
+        raise PoiseError("no OSC", "datagram", code="not-osc")
     out = list[int | float | str | bool]()
     for tag in tags[1:]:
         if tag in "if":
             if at + 4 > len(data):
-                raise PoiseError("no OSC", "datagram")
+                raise PoiseError("no OSC", "datagram", code="not-osc")
             out.append(struct.unpack_from(">" + tag, data, at)[0])
             at += 4
         elif tag == "s":
@@ -173,9 +173,9 @@ def _message(data: bytes) -> Message:
         elif tag in "TF":
             out.append(tag == "T")
         else:
-            raise PoiseError("unknown argument", "datagram")
+            raise PoiseError("unknown argument", "datagram", code="wrong-type")
     if at != len(data):
-        raise PoiseError("no OSC", "datagram")
+        raise PoiseError("no OSC", "datagram", code="not-osc")
     return Message(address, tuple(out))
 
 
@@ -183,14 +183,14 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
     """A word that ends with 0, filled up with 0 to a multiple of 4, and where the next part begins."""
     end = data.find(b"\0", at)
     if end < 0:
-        raise PoiseError("no OSC", "datagram")
+        raise PoiseError("no OSC", "datagram", code="not-osc")
     after = end + 4 - end % 4
     if after > len(data) or any(data[end:after]):
-        raise PoiseError("no OSC", "datagram")
+        raise PoiseError("no OSC", "datagram", code="not-osc")
     try:
         return data[at:end].decode("utf-8"), after
     except UnicodeDecodeError:
-        raise PoiseError("no OSC", "datagram") from None
+        raise PoiseError("no OSC", "datagram", code="not-osc") from None
 
 
 def encoded(address: str, arguments: Sequence[int | float | str]) -> bytes:
@@ -283,7 +283,7 @@ class Avatar:
         pos, rot = from_unity(values[:, :3], values[:, 3:])
         norms = np.linalg.norm(rot, axis=-1, keepdims=True)
         if not (norms > 0.5).all() or not (norms < 2.0).all():
-            raise PoiseError("no rotation", "VMC")
+            raise PoiseError("no rotation", "VMC", code="not-a-rotation")
         old = self.skeleton
         if old is None or list(old.names) != names or np.abs(old.offsets[1:] - pos[1:]).max() > GROWS_M:
             self.skeleton = skeleton_of(dict(zip(names, pos, strict=True)))
@@ -294,15 +294,15 @@ class Avatar:
 def _transform(arguments: tuple[object, ...]) -> tuple[str, np.ndarray]:
     """Name, and place and rotation as `(7)`."""
     if len(arguments) < 8 or not isinstance(arguments[0], str):
-        raise PoiseError("other arguments", "VMC")
+        raise PoiseError("other arguments", "VMC", code="fields-differ")
     numbers = arguments[1:8]
     if not all(isinstance(x, float) for x in numbers):
-        raise PoiseError("no number", "VMC")
+        raise PoiseError("no number", "VMC", code="not-a-number")
     out = np.array(numbers, dtype=float)
     if not np.isfinite(out).all():
-        raise PoiseError("not finite", "VMC")
+        raise PoiseError("not finite", "VMC", code="not-finite")
     if np.abs(out).max() > 1000.0:
-        raise PoiseError("too far away", "VMC")
+        raise PoiseError("too far away", "VMC", code="too-far")
     return arguments[0], out
 
 
@@ -357,7 +357,7 @@ class VmcSource:
             for old in [s for s, (_, at) in self._avatars.items() if now - at > 30.0]:
                 del self._avatars[old]
             if len(self._avatars) >= SENDERS:
-                raise PoiseError("too many senders", "VMC")
+                raise PoiseError("too many senders", "VMC", code="over-limit")
             known = (Avatar(f"vmc {sender[0]}:{sender[1]}"), now)
         self._avatars[sender] = (known[0], now)
         return known[0]
@@ -517,11 +517,15 @@ class VmcSink:
     def __init__(self, to: str, puppet: OwnPuppet, character: int = 0):
         host, _, port = to.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
-            raise PoiseError(f"VMC goes to HOST:PORT, such as 127.0.0.1:39540, got '{to}'")
+            raise PoiseError(
+                f"VMC goes to HOST:PORT, such as 127.0.0.1:39540, got '{to}'", code="address-malformed"
+            )
         try:
             where = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)[0]
         except OSError as problem:
-            raise PoiseError(f"there is no host '{host}' ({problem.strerror})") from problem
+            raise PoiseError(
+                f"there is no host '{host}' ({problem.strerror})", code="unknown-host"
+            ) from problem
         self._to, self.puppet, self.character = where[4], puppet, character
         self._socket = socket.socket(where[0], socket.SOCK_DGRAM)
         self._waiting: queue.Queue[tuple[np.ndarray, np.ndarray, Own | None, float] | None]

@@ -154,6 +154,7 @@ class World:
             raise PoiseError(
                 "the policy has not learned to get up, which live motion needs",
                 hint="Train one on a library with a clip that gets up",
+                code="recovery-not-learned",
             )
         self.tracker, self.count = tracker, count
         task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
@@ -186,7 +187,9 @@ class World:
         self._ahead: Ahead | None = None
         self._look: Callable[[], Ahead] = lambda: (AheadBeside if beside else AheadAtOnce)(tracker, seed)
         if lookahead and tracker.value is None:
-            raise PoiseError("the policy was saved without its critic, which lookahead needs")
+            raise PoiseError(
+                "the policy was saved without its critic, which lookahead needs", code="critic-missing"
+            )
         self._set_down()
         self.look_ahead(lookahead)
 

@@ -61,7 +61,9 @@ def foot_contacts(
     ground in mid-swing. Where all points in contact are fast, the character skates and all count.
     """
     if foot_points.ndim < 3 or foot_points.shape[-1] != 3:
-        raise PoiseError(f"foot points must be (..., T, F, 3), got {tuple(foot_points.shape)}")
+        raise PoiseError(
+            f"foot points must be (..., T, F, 3), got {tuple(foot_points.shape)}", code="wrong-shape"
+        )
     step = torch.diff(foot_points, dim=-3) * fps
     low = foot_points[..., 2] - ground <= height
     contact = low[..., 1:, :] & low[..., :-1, :] & (step[..., 2].abs() <= CONTACT_RISE)
@@ -336,10 +338,11 @@ def help_audit(
         shapes = ", ".join(str(tuple(p.shape)) for p in parts)
         raise PoiseError(
             "force, torque, point_vel and ang_vel must share one shape, (T, 3) or (..., T, M, 3), "
-            f"got {shapes}"
+            f"got {shapes}",
+            code="wrong-shape",
         )
     if not mass > 0:
-        raise PoiseError(f"the character's mass must be above 0 kg, got {mass}")
+        raise PoiseError(f"the character's mass must be above 0 kg, got {mass}", code="out-of-range")
     if force.ndim == 2:
         force, torque, point_vel, ang_vel = (p.unsqueeze(-2) for p in parts)
     force_n = force.norm(dim=-1).sum(-1)

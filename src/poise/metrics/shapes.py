@@ -50,12 +50,14 @@ class Shapes:
             value = torch.as_tensor(value)
             if tuple(value.shape) != (count, *width):
                 want, got = (count, *width), tuple(value.shape)
-                raise PoiseError(f"shapes.{name} must be {want} for {count} geoms, got {got}")
+                raise PoiseError(
+                    f"shapes.{name} must be {want} for {count} geoms, got {got}", code="wrong-shape"
+                )
             object.__setattr__(self, name, value.long() if name in ("kind", "body") else value)
         known = (self.kind >= SPHERE) & (self.kind <= BOX)
         if count == 0 or not bool(known.all()):
             what = "no geom" if count == 0 else f"a geom of kind {int(self.kind[~known][0])}"
-            raise PoiseError(f"shapes hold {what}", hint=f"Known kinds: {KINDS}")
+            raise PoiseError(f"shapes hold {what}", hint=f"Known kinds: {KINDS}", code="unknown-shape")
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -64,7 +66,7 @@ class Shapes:
         """The geoms that belong to `bodies`."""
         keep = torch.isin(self.body, torch.as_tensor(list(bodies), dtype=torch.long))
         if not bool(keep.any()):
-            raise PoiseError(f"none of the bodies {list(bodies)} has a geom")
+            raise PoiseError(f"none of the bodies {list(bodies)} has a geom", code="no-shapes")
         mass = None if self.mass is None else self.mass[keep]
         parts = (a[keep] for a in (self.kind, self.size, self.pos, self.quat, self.body))
         return Shapes(*parts, mass=mass)
@@ -91,11 +93,13 @@ def _placed(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> _Placed:
     if (*body_pos.shape[:-1], 4) != tuple(body_quat.shape) or body_pos.shape[-1] != 3:
         raise PoiseError(
             f"body poses must be (..., B, 3) and (..., B, 4), got {tuple(body_pos.shape)} "
-            f"and {tuple(body_quat.shape)}"
+            f"and {tuple(body_quat.shape)}",
+            code="wrong-shape",
         )
     if int(shapes.body.max()) >= body_pos.shape[-2]:
         raise PoiseError(
-            f"shapes name body {int(shapes.body.max())}, but the poses hold {body_pos.shape[-2]} bodies"
+            f"shapes name body {int(shapes.body.max())}, but the poses hold {body_pos.shape[-2]} bodies",
+            code="index-outside",
         )
     pos, quat, size = (a.to(body_pos) for a in (shapes.pos, shapes.quat, shapes.size))
     # Unit quaternions keep every digit.

@@ -24,13 +24,14 @@ def _check_pair(pos: Tensor, ref: Tensor) -> None:
     if pos.shape != ref.shape or pos.ndim < 3 or pos.shape[-1] != 3:
         raise PoiseError(
             "positions and reference must both be (..., T, B, 3), "
-            f"got {tuple(pos.shape)} and {tuple(ref.shape)}"
+            f"got {tuple(pos.shape)} and {tuple(ref.shape)}",
+            code="wrong-shape",
         )
 
 
 def _check_fps(fps: float) -> None:
     if not 0 < fps < float("inf"):
-        raise PoiseError(f"the frame rate must be above 0, got {fps}")
+        raise PoiseError(f"the frame rate must be above 0, got {fps}", code="rate-out-of-range")
 
 
 def mpjpe_global(pos: Tensor, ref: Tensor) -> Tensor:
@@ -140,7 +141,11 @@ def success_rule(rule: str | SuccessRule) -> SuccessRule:
     if isinstance(rule, SuccessRule):
         return rule
     if rule not in RULES:
-        raise PoiseError(f"there is no success rule '{rule}'", hint=did_you_mean(rule, tuple(RULES)))
+        raise PoiseError(
+            f"there is no success rule '{rule}'",
+            hint=did_you_mean(rule, tuple(RULES)),
+            code="unknown-choice",
+        )
     return RULES[rule]
 
 
@@ -180,7 +185,9 @@ def success(
     _check_pair(pos, ref)
     chosen = success_rule(rule)
     if lengths.shape != pos.shape[:-3]:
-        raise PoiseError(f"lengths must be {tuple(pos.shape[:-3])}, got {tuple(lengths.shape)}")
+        raise PoiseError(
+            f"lengths must be {tuple(pos.shape[:-3])}, got {tuple(lengths.shape)}", code="wrong-shape"
+        )
     valid = torch.arange(pos.shape[-3], device=pos.device) < lengths.unsqueeze(-1)
     if chosen.measure in ("mean", "max"):
         picked = slice(None) if bodies is None else list(bodies)
@@ -281,7 +288,9 @@ def masked_mean(
     if mask is None:
         mask = torch.ones_like(x, dtype=torch.bool)
     if mask.shape != x.shape:
-        raise PoiseError(f"the mask has shape {tuple(mask.shape)}, the values {tuple(x.shape)}")
+        raise PoiseError(
+            f"the mask has shape {tuple(mask.shape)}, the values {tuple(x.shape)}", code="wrong-shape"
+        )
     total = torch.where(mask, x, torch.zeros_like(x)).sum(dims)
     return total / mask.sum(dims)
 

@@ -28,6 +28,7 @@ def check_rate(fps: float, where: str | Path | None = None) -> None:
             f"the frame rate must be from {MIN_FPS:g} to {MAX_FPS:g} per second, got {fps:.6g}",
             where,
             "State the right one with --fps F" if isinstance(where, Path) else None,
+            code="rate-out-of-range",
         )
 
 
@@ -35,7 +36,9 @@ def check_frames(frames: int, where: str | Path | None = None) -> None:
     """Refuses a clip of less than two frames, which shows no motion."""
     if frames < 2:
         plural = "" if frames == 1 else "s"
-        raise PoiseError(f"the clip has {frames} frame{plural}; motion needs at least 2", where)
+        raise PoiseError(
+            f"the clip has {frames} frame{plural}; motion needs at least 2", where, code="clip-too-short"
+        )
 
 
 def check_poses(frames: int, joints: int, where: str | Path | None = None) -> None:
@@ -45,6 +48,7 @@ def check_poses(frames: int, joints: int, where: str | Path | None = None) -> No
             f"it has {frames} frames of {joints} joints, more than the {MAX_POSES} poses that are read",
             where,
             "Cut it shorter, or state a lower rate with --fps F",
+            code="clip-too-long",
         )
 
 
@@ -87,6 +91,7 @@ class Clip:
                 f"root_pos must be (T, 3) and rot (T, {joints}, 4), got "
                 f"{self.root_pos.shape} and {self.rot.shape}",
                 self.name,
+                code="wrong-shape",
             )
         check_frames(frames, self.name)
         check_rate(self.fps, self.name)
@@ -94,7 +99,9 @@ class Clip:
             object.__setattr__(self, "contacts", ())
         if not np.isfinite(self.root_pos).all():
             frame = int(np.argwhere(~np.isfinite(self.root_pos))[0][0])
-            raise PoiseError(f"the root position is not finite at frame {frame}", self.name)
+            raise PoiseError(
+                f"the root position is not finite at frame {frame}", self.name, code="not-finite"
+            )
         norms = np.linalg.norm(self.rot, axis=-1)
         if not np.isfinite(norms).all() or np.abs(norms - 1).max() > 1e-4:
             bad = np.argwhere(~(np.abs(norms - 1) <= 1e-4))[0]
@@ -102,6 +109,7 @@ class Clip:
                 f"the rotation of joint '{self.skeleton.names[bad[1]]}' at frame {bad[0]} is not a "
                 f"unit quaternion (norm {norms[tuple(bad)]:.4g})",
                 self.name,
+                code="not-a-rotation",
             )
 
     @property
@@ -144,7 +152,7 @@ class ClipLibrary:
 
     def __post_init__(self) -> None:
         if not self.clips:
-            raise PoiseError("a library needs at least one clip")
+            raise PoiseError("a library needs at least one clip", code="no-clips")
         first = self.clips[0].skeleton
         for clip in self.clips[1:]:
             if clip.skeleton.names != first.names or clip.skeleton.parents != first.parents:
@@ -152,13 +160,15 @@ class ClipLibrary:
                     f"its joints differ from those of '{self.clips[0].name}'",
                     clip.name,
                     "Give one library clips of one hierarchy",
+                    code="skeleton-differs",
                 )
         if not self.weights:
             object.__setattr__(self, "weights", tuple(c.seconds for c in self.clips))
         if len(self.weights) != len(self.clips) or min(self.weights) < 0 or sum(self.weights) <= 0:
             raise PoiseError(
                 f"a library of {len(self.clips)} clips needs as many weights, none negative and not "
-                f"all zero, got {self.weights}"
+                f"all zero, got {self.weights}",
+                code="bad-weights",
             )
 
     @classmethod
@@ -209,7 +219,9 @@ def resample(clip: Clip, fps: float, smooth: bool = False) -> Clip:
     count = int(np.floor(clip.seconds * fps + 1e-2)) + 1
     if count < 2:
         raise PoiseError(
-            f"the clip lasts {clip.seconds:.3f} s, less than one frame at {fps:g} fps", clip.name
+            f"the clip lasts {clip.seconds:.3f} s, less than one frame at {fps:g} fps",
+            clip.name,
+            code="clip-too-short",
         )
     at = np.minimum(np.arange(count) / fps * clip.fps, clip.frames - 1)
     low = np.minimum(np.floor(at + 1e-9).astype(int), clip.frames - 2)

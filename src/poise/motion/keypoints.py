@@ -33,24 +33,30 @@ class Keypoints:
         count = len(self.names)
         if positions.ndim != 3 or positions.shape[1:] != (count, 3):
             raise PoiseError(
-                f"positions must be (T, {count}, 3) for {count} names, got {positions.shape}", self.name
+                f"positions must be (T, {count}, 3) for {count} names, got {positions.shape}",
+                self.name,
+                code="wrong-shape",
             )
         if count == 0:
-            raise PoiseError("there is no keypoint", self.name)
+            raise PoiseError("there is no keypoint", self.name, code="no-keypoints")
         seen: set[str] = set()
         for name in self.names:
             if name in seen:
-                raise PoiseError(f"keypoint '{name}' appears twice", self.name)
+                raise PoiseError(f"keypoint '{name}' appears twice", self.name, code="name-repeated")
             seen.add(name)
         check_rate(self.fps, self.name)
         if np.isinf(positions).any():
             t, k, _ = np.argwhere(np.isinf(positions))[0]
-            raise PoiseError(f"keypoint '{self.names[k]}' is infinite at frame {t}", self.name)
+            raise PoiseError(
+                f"keypoint '{self.names[k]}' is infinite at frame {t}", self.name, code="not-finite"
+            )
         if self.confidence is not None:
             confidence = np.array(self.confidence, dtype=np.float64)
             if confidence.shape != positions.shape[:2]:
                 raise PoiseError(
-                    f"confidence must be {positions.shape[:2]}, got {confidence.shape}", self.name
+                    f"confidence must be {positions.shape[:2]}, got {confidence.shape}",
+                    self.name,
+                    code="wrong-shape",
                 )
             positions[~(confidence > 0)] = np.nan
             confidence.flags.writeable = False

@@ -53,11 +53,14 @@ class Noise:
             if bad or (
                 name not in ("axis", "camera", "bias") and any(v < 0 for v in numbers if v is not None)
             ):
-                raise PoiseError(f"{name} of {type(self).__name__} must not be negative, got {value}")
+                raise PoiseError(
+                    f"{name} of {type(self).__name__} must not be negative, got {value}",
+                    code="out-of-range",
+                )
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         """What is seen with this noise."""
-        raise PoiseError(f"{type(self).__name__} does not say what it does")
+        raise PoiseError(f"{type(self).__name__} does not say what it does", code="not-implemented")
 
 
 def side_pairs(names: tuple[str, ...]) -> tuple[tuple[int, int, str], ...]:
@@ -328,7 +331,7 @@ def _unit(axis: Vector) -> np.ndarray:
     """The unit vector along `axis`; one without length is refused."""
     length = float(np.linalg.norm(axis))
     if not length > 1e-9:
-        raise PoiseError(f"the axis must have a length, got {axis}")
+        raise PoiseError(f"the axis must have a length, got {axis}", code="no-direction")
     return np.array(axis) / length
 
 
@@ -390,7 +393,9 @@ def perturb_positions(
 ) -> np.ndarray:
     """Positions `(T, K, 3)` m of points called `names`, with noise; what is lost is NaN."""
     if positions.ndim != 3 or positions.shape[1:] != (len(names), 3):
-        raise PoiseError(f"positions must be (T, {len(names)}, 3), got {positions.shape}")
+        raise PoiseError(
+            f"positions must be (T, {len(names)}, 3), got {positions.shape}", code="wrong-shape"
+        )
     seen = Seen(np.asarray(positions, dtype=float), None, fps, side_pairs(tuple(names)))
     for one, rng in _each(noise, seed, name):
         seen = one.on(seen, rng)
@@ -418,7 +423,7 @@ def robustness_levels(
     each: adds a ladder for every kind alone, without a second rung for no noise at all.
     """
     if not noise or any(s < 0 for s in strengths):
-        raise PoiseError("a ladder needs some noise and strengths from 0 on")
+        raise PoiseError("a ladder needs some noise and strengths from 0 on", code="out-of-range")
     rungs = sorted(strengths)
     out = [Level(f"all x{s:g}" if s else "clean", s, scaled(noise, s)) for s in rungs]
     if each:

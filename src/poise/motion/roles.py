@@ -92,6 +92,7 @@ class Roles:
             f"joints {', '.join(self.skeleton.names[:30])}{', ...' if len(self.skeleton) > 30 else ''}",
             self.skeleton.source.path,
             f"State it by hand, for example --map JOINT={lost[0]}",
+            code="role-missing",
         )
 
 
@@ -111,7 +112,7 @@ def check_role(role: str) -> str:
     if sided and side and numbered == (kind in _FINGER_KINDS):
         return role
     known = ("hips", "spine1", "neck1", "head", *(f"{s}_{k}" for k in (*ARM, *LEG) for s in SIDES))
-    raise PoiseError(f"there is no role '{role}'. {did_you_mean(role, known)}")
+    raise PoiseError(f"there is no role '{role}'. {did_you_mean(role, known)}", code="unknown-role")
 
 
 def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> Roles:
@@ -136,7 +137,8 @@ def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> R
     for joint, role in fixed.items():
         if role in taken:
             raise PoiseError(
-                f"both '{taken[role]}' and '{skeleton.names[joint]}' were stated to be {role}"
+                f"both '{taken[role]}' and '{skeleton.names[joint]}' were stated to be {role}",
+                code="role-conflict",
             )
         taken[role] = skeleton.names[joint]
     written = {
@@ -475,7 +477,10 @@ def _stated(
     guessed_source, guessed_target = find_roles(source), find_roles(target)
     for a, b in stated.items():
         if b in ends and b in target.names:
-            raise PoiseError(f"both '{ends[b]}' and '{a}' were mapped to '{b}'; one joint moves each")
+            raise PoiseError(
+                f"both '{ends[b]}' and '{a}' were mapped to '{b}'; one joint moves each",
+                code="joint-mapped-twice",
+            )
         ends[b] = a
         if a not in source.names and _is_role(a):
             _known(target, b, "target")
@@ -504,7 +509,10 @@ def _is_role(text: str) -> bool:
 
 def _known(skeleton: Skeleton, name: str, side: str) -> None:
     if name not in skeleton.names:
-        raise PoiseError(f"the {side} has no joint '{name}'. {did_you_mean(name, skeleton.names)}")
+        raise PoiseError(
+            f"the {side} has no joint '{name}'. {did_you_mean(name, skeleton.names)}",
+            code="unknown-joint",
+        )
 
 
 def _direct(source: Roles, target: Roles) -> list[tuple[int, int]]:
@@ -555,5 +563,6 @@ def _check_order(source: Skeleton, target: Skeleton, direct: Mapping[int, int]) 
                 raise PoiseError(
                     f"the mapping turns the hierarchy round: '{target.names[b_up]}' carries "
                     f"'{target.names[b]}' in the target, but their '{source.names[a_up]}' hangs below "
-                    f"'{source.names[a]}' in the source"
+                    f"'{source.names[a]}' in the source",
+                    code="hierarchy-reversed",
                 )

@@ -95,24 +95,26 @@ class Skeleton:
         if len(self.parents) != count or offsets.shape != (count, 3):
             raise PoiseError(
                 f"a skeleton needs one parent and one offset per joint, got {count} names, "
-                f"{len(self.parents)} parents and offsets of shape {offsets.shape}"
+                f"{len(self.parents)} parents and offsets of shape {offsets.shape}",
+                code="count-differs",
             )
         if count == 0:
-            raise PoiseError("a skeleton needs at least one joint")
+            raise PoiseError("a skeleton needs at least one joint", code="no-joints")
         seen: set[str] = set()
         for name in self.names:
             if name in seen:
-                raise PoiseError(f"joint name '{name}' appears twice")
+                raise PoiseError(f"joint name '{name}' appears twice", code="name-repeated")
             seen.add(name)
         for j, parent in enumerate(self.parents):
             if (j == 0) != (parent == -1) or parent >= j:
                 raise PoiseError(
                     f"joint '{self.names[j]}' has parent index {parent}; the first joint must be "
-                    "the only root and parents must come before children"
+                    "the only root and parents must come before children",
+                    code="parent-order",
                 )
         if not np.isfinite(offsets).all():
             bad = self.names[int(np.argwhere(~np.isfinite(offsets))[0][0])]
-            raise PoiseError(f"joint '{bad}' has an offset that is not finite")
+            raise PoiseError(f"joint '{bad}' has an offset that is not finite", code="not-finite")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -143,7 +145,9 @@ class Skeleton:
         try:
             return self.names.index(name)
         except ValueError:
-            raise PoiseError(f"there is no joint '{name}'. {did_you_mean(name, self.names)}") from None
+            raise PoiseError(
+                f"there is no joint '{name}'. {did_you_mean(name, self.names)}", code="unknown-joint"
+            ) from None
 
     def same_bones(self, other: Skeleton, atol: float = SAME_M) -> bool:
         """Whether the other skeleton has the same joints and bones, to within `atol` m."""

@@ -81,7 +81,9 @@ class FrameBank:
         """
         kept = [c for c, name in enumerate(self.clips) if wanted(name)]
         if not kept:
-            raise PoiseError(f"none of the {len(self.clips)} clips belongs to this part of the split")
+            raise PoiseError(
+                f"none of the {len(self.clips)} clips belongs to this part of the split", code="no-clips"
+            )
         first = self.first.tolist()
         rows = torch.cat([torch.arange(first[c], first[c + 1]) for c in kept])
         sizes = torch.tensor([0] + [first[c + 1] - first[c] for c in kept])
@@ -108,13 +110,15 @@ def pack_frames(
         PoiseError: no clips, clips of different hierarchies, or no feet that could be found by name.
     """
     if not clips:
-        raise PoiseError("there are no clips to cut windows from")
+        raise PoiseError("there are no clips to cut windows from", code="no-clips")
     clips = [without_still_root(at_rate(clip, fps)) for clip in clips]
     one = clips[0].skeleton
     for clip in clips:
         if clip.skeleton.names != one.names or clip.skeleton.parents != one.parents:
             hint = f"Its joints differ from those of '{clips[0].name}'; give clips of one hierarchy"
-            raise PoiseError("the clips do not share a skeleton", clip.name, hint)
+            raise PoiseError(
+                "the clips do not share a skeleton", clip.name, hint, code="skeleton-differs"
+            )
     rot = [unwrap_quats(normalize(torch.tensor(c.rot))) for c in clips]
     sizes = torch.tensor([0] + [c.frames for c in clips])
     bank = FrameBank(
@@ -178,7 +182,7 @@ def foot_joints(skeleton: Skeleton) -> tuple[int, ...]:
         pairs = [(skeleton.parents[j], j) for j in toes]
     if not pairs:
         hint = "Name the ankle and toe joints"
-        raise PoiseError("no joint is called a toe, foot or ankle", hint=hint)
+        raise PoiseError("no joint is called a toe, foot or ankle", hint=hint, code="role-missing")
     pairs.sort(key=lambda pair: (not low[pair[0]].startswith("l") and "left" not in low[pair[0]]
                                  and not low[pair[0]].endswith("_l"), pair))  # fmt: skip
     return tuple(dict.fromkeys(j for pair in pairs for j in pair))
@@ -259,7 +263,10 @@ def train_statistics(
     """Mean and deviation `(J, 3)` m of global positions over all frames of the train windows."""
     starts = window_starts(bank.first, window, offset)
     if not len(starts):
-        raise PoiseError(f"no clip has more than {window} frames, so there are no train statistics")
+        raise PoiseError(
+            f"no clip has more than {window} frames, so there are no train statistics",
+            code="clip-too-short",
+        )
     total = square = torch.zeros(len(bank.names), 3, dtype=torch.float64)
     for part in starts.split(chunk):
         root, rot, offsets = cut(bank, part, window)
@@ -286,10 +293,17 @@ def other_sides(names: tuple[str, ...], parents: tuple[int, ...]) -> Tensor:
     for left, right, _ in side_pairs(names):
         other[left], other[right] = right, left
     if bool((other == torch.arange(len(names))).all()):
-        raise PoiseError("no joint's name tells left from right", hint="Name joints LeftArm, RightArm")
+        raise PoiseError(
+            "no joint's name tells left from right",
+            hint="Name joints LeftArm, RightArm",
+            code="sides-unknown",
+        )
     for j, parent in enumerate(parents):
         if parent >= 0 and int(other[parent]) != parents[int(other[j])]:
-            raise PoiseError(f"'{names[j]}' and '{names[int(other[j])]}' hang on different joints")
+            raise PoiseError(
+                f"'{names[j]}' and '{names[int(other[j])]}' hang on different joints",
+                code="mirror-unknown",
+            )
     return other
 
 
@@ -355,14 +369,20 @@ def _normal(names: tuple[str, ...], parents: tuple[int, ...], offsets: Tensor) -
         apart = apart + (rest[:, left] - rest[:, right]).mean(0)
     level = apart * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
     if float(level.norm()) < 1e-6 or abs(float(apart[2])) > _LEVEL * float(level.norm()):
-        raise PoiseError("the skeleton's left and right do not lie level at rest, so no mirror is known")
+        raise PoiseError(
+            "the skeleton's left and right do not lie level at rest, so no mirror is known",
+            code="mirror-unknown",
+        )
     return level / level.norm()
 
 
 def joined(a: FrameBank, b: FrameBank) -> FrameBank:
     """The clips of two banks of one hierarchy and rate, `a` first; its feet and facing count."""
     if a.names != b.names or a.parents != b.parents or a.fps != b.fps:
-        raise PoiseError("two sets of frames of different skeletons or rates cannot be joined")
+        raise PoiseError(
+            "two sets of frames of different skeletons or rates cannot be joined",
+            code="skeleton-differs",
+        )
     both = {k: torch.cat((getattr(a, k), getattr(b, k))) for k in ("root", "rot", "offsets")}
     first = torch.cat((a.first, b.first[1:] + a.first[-1]))
     return replace(a, **both, first=first, clips=a.clips + b.clips)

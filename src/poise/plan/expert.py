@@ -213,7 +213,9 @@ def inverse_dynamics(
     ):
         if value.shape != (frames, width):
             raise PoiseError(
-                f"{name} must be ({frames}, {width}), got {value.shape}", "inverse dynamics"
+                f"{name} must be ({frames}, {width}), got {value.shape}",
+                "inverse dynamics",
+                code="wrong-shape",
             )
     model = copy.deepcopy(model)
     # Contact and limit forces of the simulator would be a second answer to the same question.
@@ -350,7 +352,10 @@ class Expert:
         self.plan = plan or make_plan(env.reference, self.config)
         self._residual = env.task.residual
         if isinstance(self._residual, ExplicitResidual) and 0 not in self._residual.bodies:
-            raise PoiseError("the expert needs a residual force on the root, body row 0")
+            raise PoiseError(
+                "the expert needs a residual force on the root, body row 0",
+                code="residual-force-missing",
+            )
         model = env.backend.model
         # The servos of each body, `(S, n)`.
         models = [model, *(h.model for h in env.reference.bodies[1:])]

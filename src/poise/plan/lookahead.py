@@ -246,23 +246,25 @@ class LookaheadConfig:
             least = max(FEWEST, 2 * len(self.smoothing))
             what = f"lookahead needs at least {least} candidates, got {self.candidates}"
             steps = least * self.horizon / self.hold_steps
-            raise PoiseError(what, hint=f"Give a budget of {steps:g} simulated steps or more")
+            raise PoiseError(
+                what, hint=f"Give a budget of {steps:g} simulated steps or more", code="budget-too-small"
+            )
         if not 1 <= self.hold_steps <= self.horizon:
             what = f"hold_steps must lie in 1 to the horizon {self.horizon}, got {self.hold_steps}"
-            raise PoiseError(what, "LookaheadConfig")
+            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
         low, high = self.noise_range
         if not 0 < low <= high or not 0 < self.discount <= 1 or not 0 <= self.warm <= 1:
             what = "noise_range must rise from above 0, discount and warm must lie in 0 to 1"
-            raise PoiseError(what, "LookaheadConfig")
+            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
         if not self.smoothing or not all(0 <= s < 1 for s in self.smoothing):
             what = f"shares of smoothing must lie in 0 to below 1, got {self.smoothing}"
-            raise PoiseError(what, "LookaheadConfig")
+            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
         if self.corrections[:1] != (1.0,) or not all(0 <= c <= 1 for c in self.corrections):
             what = f"corrections must begin with 1 and lie in 0 to 1, got {self.corrections}"
-            raise PoiseError(what, "LookaheadConfig")
+            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
         if min(self.jerk_price, self.slide_price, self.slack) < 0 or self.strict_m <= 0:
             what = "prices and slack must be at least 0, strict_m above"
-            raise PoiseError(what, "LookaheadConfig")
+            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
 
     @property
     def budget(self) -> float:
@@ -338,7 +340,7 @@ class Lookahead:
         self.config = c = config or LookaheadConfig(candidates=copies.num_envs)
         if copies.num_envs != c.candidates:
             what = f"{c.candidates} candidates need as many copies, got {copies.num_envs}"
-            raise PoiseError(what, "Lookahead")
+            raise PoiseError(what, "Lookahead", code="count-differs")
         self._candidates = Candidates(copies, policy, value, c.discount)
         shares = torch.tensor(c.smoothing)
         turn = torch.arange(c.candidates)
@@ -390,7 +392,11 @@ class Lookahead:
         """
         env = self._env
         if env is None:
-            raise PoiseError("a lookahead acts in an environment", hint="Call watch(env) first")
+            raise PoiseError(
+                "a lookahead acts in an environment",
+                hint="Call watch(env) first",
+                code="environment-missing",
+            )
         pos, fresh = env.pose().pos, (env.age == 0).tolist()
         offsets = torch.zeros(len(obs), env.num_actions)
         keep, much = torch.zeros(len(obs), 1), torch.ones(len(obs), 1)

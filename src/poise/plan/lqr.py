@@ -156,7 +156,9 @@ def regulate(
     rows, n, m = b.shape
     if int(np.sum(lengths)) != rows:
         raise PoiseError(
-            f"the motions have {int(np.sum(lengths))} rows, and {rows} are given", "regulate"
+            f"the motions have {int(np.sum(lengths))} rows, and {rows} are given",
+            "regulate",
+            code="count-differs",
         )
     damping = np.zeros(rows) if damping is None else damping
     out = Regulator(

@@ -57,14 +57,16 @@ class SamplingConfig:
     def __post_init__(self) -> None:
         if self.samples_per_state < 2 or self.characters < 2 * self.samples_per_state:
             what = f"got {self.characters} characters, {self.samples_per_state} from each state"
-            raise PoiseError(what, "SamplingConfig", "Take 8 or more, 2 or more from each")
+            raise PoiseError(
+                what, "SamplingConfig", "Take 8 or more, 2 or more from each", code="out-of-range"
+            )
         counts, spread = (
             (self.hold_steps, self.rounds, self.back),
             0 < self.noise_range[0] <= self.noise_range[1],
         )
         if min(counts) < 1 or self.retries < 0 or not spread:
             what = "hold_steps, rounds, back and noise_range must be positive, and noise_range must rise"
-            raise PoiseError(what, "SamplingConfig")
+            raise PoiseError(what, "SamplingConfig", code="out-of-range")
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,16 +64,16 @@ class TeacherConfig:
                 f"worlds and decisions must be at least 1 and fewer best than candidates, got "
                 f"{self.worlds}, {self.decisions}, {self.best} of {self.candidates}"
             )
-            raise PoiseError(what, "TeacherConfig")
+            raise PoiseError(what, "TeacherConfig", code="out-of-range")
         if not 1 <= self.hold_steps <= self.horizon:
             what = f"hold_steps must lie in 1 to the horizon {self.horizon}, got {self.hold_steps}"
-            raise PoiseError(what, "TeacherConfig")
+            raise PoiseError(what, "TeacherConfig", code="out-of-range")
         low, high = self.noise_range
         if not 0 < low <= high or not 0 < self.discount <= 1 or not 0 <= self.own <= 1:
             what = "noise_range must rise from above 0, discount and own must lie in 0 to 1"
-            raise PoiseError(what, "TeacherConfig")
+            raise PoiseError(what, "TeacherConfig", code="out-of-range")
         if min(self.jerk_price, self.slide_price) < 0:
-            raise PoiseError("prices must be at least 0", "TeacherConfig")
+            raise PoiseError("prices must be at least 0", "TeacherConfig", code="out-of-range")
 
 
 class LookaheadTeacher:
@@ -94,7 +94,7 @@ class LookaheadTeacher:
         if (env.num_envs, copies.num_envs) != wanted:
             got = f"{env.num_envs} worlds and {copies.num_envs} copies"
             what = f"got {got}, not {wanted[0]} and {wanted[1]}"
-            raise PoiseError(what, "LookaheadTeacher")
+            raise PoiseError(what, "LookaheadTeacher", code="count-differs")
         self._rng = torch.Generator().manual_seed(seed)
         self._past: Tensor | None = None
 

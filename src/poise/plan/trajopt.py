@@ -77,10 +77,12 @@ class TrajOptConfig:
     def __post_init__(self) -> None:
         if self.iterations < 0 or not 0 < self.less < 1 or min(*self.sizes, self.segment_s) <= 0:
             what = "iterations must not be negative, less lie in (0, 1), sizes and segment_s be above 0"
-            raise PoiseError(what, "TrajOptConfig")
+            raise PoiseError(what, "TrajOptConfig", code="out-of-range")
         if 0.0 not in self.steps:
             raise PoiseError(
-                "one of the steps must be 0, with which a trajectory stays", "TrajOptConfig"
+                "one of the steps must be 0, with which a trajectory stays",
+                "TrajOptConfig",
+                code="out-of-range",
             )
 
     def size(self, iteration: int) -> float:
@@ -278,7 +280,11 @@ class TrajectoryOptimizer:
         self, reference: Reference, sim: SimConfig, config: TrajOptConfig | None = None, threads: int = 0
     ):
         if len(reference.bodies) > 1:
-            raise PoiseError("trajectories are optimised for one body", hint="Train without body shapes")
+            raise PoiseError(
+                "trajectories are optimised for one body",
+                hint="Train without body shapes",
+                code="single-body-only",
+            )
         self.reference, self.config, self.sim = reference, config or TrajOptConfig(), sim
         self.threads, model = threads, alone(reference.humanoid, sim)
         self.model, self.joints = model, model.nu

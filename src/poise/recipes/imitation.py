@@ -53,7 +53,7 @@ def as_library(clips: Clips) -> ClipLibrary:
     clip = read_clip(clips) if isinstance(clips, str | Path) else clips
     if not isinstance(clip, Clip):
         what = f"a recipe is built of a clip, a motion file or a ClipLibrary, got {type(clip).__name__}"
-        raise PoiseError(what, hint="Put several clips into ClipLibrary.of([...])")
+        raise PoiseError(what, hint="Put several clips into ClipLibrary.of([...])", code="wrong-type")
     return ClipLibrary.of(clip)
 
 
@@ -222,6 +222,7 @@ class Imitation:
             raise PoiseError(
                 "a style of your own watches an environment of its own",
                 hint="Give that environment as env=, or give AmpConfig settings",
+                code="settings-conflict",
             )
         rank = comm.rank
         if dumps is not None and rank:
@@ -306,4 +307,5 @@ def check_memory(num_envs: int, bytes_each: int, free: int | None) -> None:
         f"{num_envs:,} characters would take about {num_envs * bytes_each / 1e9:.1f} GB of memory, and "
         f"{free / 1e9:.1f} GB are free",
         hint=f"At most {fit:,} fit: use --envs {fit}",
+        code="out-of-memory",
     )

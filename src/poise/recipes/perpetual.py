@@ -66,7 +66,7 @@ def _told(clip: Clip, qpos: np.ndarray, strength: float, seed: int, on: Imitatio
     out = place_on_body(seen, body.table, rate_hz=rate, near=body).qpos
     if len(out) != len(qpos):
         what = f"it has {len(out)} frames with noise and {len(qpos)} without"
-        raise PoiseError(what, clip.name, "Leave noise out, or this clip")
+        raise PoiseError(what, clip.name, "Leave noise out, or this clip", code="length-differs")
     return out
 
 

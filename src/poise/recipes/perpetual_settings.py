@@ -66,15 +66,19 @@ class RecoveryPlan:
         validate(self)
         if not 0 < self.share < 1 or not 0 < self.enough <= 1:
             what = f"share must lie in (0, 1) and enough in (0, 1], got {self.share} and {self.enough}"
-            raise PoiseError(what, "RecoveryPlan")
+            raise PoiseError(what, "RecoveryPlan", code="out-of-range")
         if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
-            raise PoiseError("recovery needs falls, trials and seconds", "RecoveryPlan")
+            raise PoiseError(
+                "recovery needs falls, trials and seconds", "RecoveryPlan", code="out-of-range"
+            )
         if self.demonstrations < 0 or not 0 < self.demonstration_share < 1:
             what = (
                 f"got {self.demonstrations} demonstrations and a demonstration_share of "
                 f"{self.demonstration_share:g}"
             )
-            raise PoiseError(what, "RecoveryPlan", "None or more, and a share between 0 and 1")
+            raise PoiseError(
+                what, "RecoveryPlan", "None or more, and a share between 0 and 1", code="out-of-range"
+            )
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,11 @@ class PushPlan:
     def __post_init__(self) -> None:
         validate(self)
         if not 0.0 < self.share <= 1.0 or not self.parts:
-            raise PoiseError(f"pushes need a share above 0 and parts, got {self.share:g}", "PushPlan")
+            raise PoiseError(
+                f"pushes need a share above 0 and parts, got {self.share:g}",
+                "PushPlan",
+                code="out-of-range",
+            )
 
 
 @dataclass(frozen=True)
@@ -243,48 +251,79 @@ class Perpetual:
     def __post_init__(self) -> None:
         validate(self)
         if self.starts < 1:
-            raise PoiseError(f"starts must be at least 1, got {self.starts}", "Perpetual")
+            raise PoiseError(
+                f"starts must be at least 1, got {self.starts}", "Perpetual", code="out-of-range"
+            )
         if self.max_primitives < 1:
-            raise PoiseError(f"there must be at least 1 primitive, got {self.max_primitives}")
+            raise PoiseError(
+                f"there must be at least 1 primitive, got {self.max_primitives}", code="out-of-range"
+            )
         first, last = self.shares
         if not 0 < first <= last <= 1:
-            raise PoiseError(f"shares must rise within (0, 1], got {self.shares}", "Perpetual")
+            raise PoiseError(
+                f"shares must rise within (0, 1], got {self.shares}", "Perpetual", code="not-rising"
+            )
         if self.recovery and last == 1:
             what = "with recovery something must follow the last primitive, got shares up to 1"
-            raise PoiseError(what, "Perpetual")
+            raise PoiseError(what, "Perpetual", code="settings-conflict")
         if not 0 < self.help_share <= 1:
-            raise PoiseError(f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual")
+            raise PoiseError(
+                f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual", code="out-of-range"
+            )
         if self.recovering.primitive == "first" and self.max_primitives < 2:
             what = "where the first primitive recovers there must be another, got max_primitives=1"
-            raise PoiseError(what, "Perpetual")
+            raise PoiseError(what, "Perpetual", code="settings-conflict")
         if self.goal == "keypoints" and self.action == "additive":
             what = "additive actions need the next frame's angles, of which keypoints tell nothing"
-            raise PoiseError(what, hint="Take absolute actions, or rotations as the goal")
+            raise PoiseError(
+                what, hint="Take absolute actions, or rotations as the goal", code="settings-conflict"
+            )
         if not 0 <= self.adaptive_sampling <= 1:
             what = f"adaptive_sampling must lie in [0, 1], got {self.adaptive_sampling}"
-            raise PoiseError(what, "Perpetual")
+            raise PoiseError(what, "Perpetual", code="out-of-range")
         if list(self.window) != sorted({k for k in self.window if k > 1}):
             what = f"window must rise from 2 or more control steps, got {self.window}"
-            raise PoiseError(what, "Perpetual", "The next step is told in any case")
+            raise PoiseError(what, "Perpetual", "The next step is told in any case", code="not-rising")
         if not 0 <= self.filter < 1:
-            raise PoiseError(f"filter must lie in 0 to below 1, got {self.filter}", "Perpetual")
+            raise PoiseError(
+                f"filter must lie in 0 to below 1, got {self.filter}", "Perpetual", code="out-of-range"
+            )
         prices = self.action_rate, self.torque_rate, self.acceleration, self.foot_slide
         if min(self.root, *prices) < 0:
-            raise PoiseError("the weight of root and all prices must be at least 0", "Perpetual")
+            raise PoiseError(
+                "the weight of root and all prices must be at least 0", "Perpetual", code="out-of-range"
+            )
         if any(not 0 < x < 100 for x in self.noise) or len(set(self.noise)) < len(self.noise):
-            raise PoiseError(f"noise needs different strengths above 0, got {self.noise}", "Perpetual")
+            raise PoiseError(
+                f"noise needs different strengths above 0, got {self.noise}",
+                "Perpetual",
+                code="out-of-range",
+            )
         if self.noise and self.shapes.several:
-            raise PoiseError("noise is learned on one body, and there are several shapes", "Perpetual")
+            raise PoiseError(
+                "noise is learned on one body, and there are several shapes",
+                "Perpetual",
+                code="settings-conflict",
+            )
         if not 0 <= self.cooling <= 1:
-            raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")
+            raise PoiseError(
+                f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual", code="out-of-range"
+            )
         if self.cooling and self.ppo.kl_target is not None:
             what = "cooling is for steps of a fixed size, and kl_target adapts them"
-            raise PoiseError(what, "Perpetual", "Set kl_target=None, or leave cooling out")
+            raise PoiseError(
+                what, "Perpetual", "Set kl_target=None, or leave cooling out", code="settings-conflict"
+            )
         if self.trajopt is not None and self.shapes.several:
             what = "trajectories are optimised for one body, and there are several shapes"
-            raise PoiseError(what, "Perpetual", "Leave one of the two out")
+            raise PoiseError(what, "Perpetual", "Leave one of the two out", code="settings-conflict")
         if self.ppo.learn_std:
-            raise PoiseError("primitives keep their action noise", "Perpetual", "Set learn_std=False")
+            raise PoiseError(
+                "primitives keep their action noise",
+                "Perpetual",
+                "Set learn_std=False",
+                code="settings-conflict",
+            )
         self._check_networks()
 
     def _check_networks(self) -> None:
@@ -292,15 +331,21 @@ class Perpetual:
         if len(other) + self.single > 1:
             given = " and ".join([*(["single"] if self.single else []), *(f"no {n}" for n in other)])
             what = f"only one of single, no multiplicative and no progressive can be, got {given}"
-            raise PoiseError(what, hint="Each of them is another network; leave one out")
+            raise PoiseError(
+                what, hint="Each of them is another network; leave one out", code="settings-conflict"
+            )
         if not self.progressive and self.combine != "product":
             raise PoiseError(
                 "primitives that learn with their composer are combined as a product",
                 "Perpetual",
                 "Set combine='product'",
+                code="settings-conflict",
             )
         if not self.progressive and self.max_primitives < 2:
-            raise PoiseError("a composer without progressive training needs at least 2 primitives")
+            raise PoiseError(
+                "a composer without progressive training needs at least 2 primitives",
+                code="settings-conflict",
+            )
 
     @classmethod
     def additive(cls, **changes: Any) -> Perpetual:

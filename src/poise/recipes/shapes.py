@@ -71,16 +71,24 @@ class BodyShapes:
 
     def __post_init__(self) -> None:
         if self.own and self.count > 1:
-            raise PoiseError("bodies are drawn or the clips' own, not both", "BodyShapes")
+            raise PoiseError(
+                "bodies are drawn or the clips' own, not both", "BodyShapes", code="settings-conflict"
+            )
         if not 1 <= self.count <= 1000:
-            raise PoiseError(f"there can be 1 to 1000 bodies, got {self.count}", "BodyShapes")
+            raise PoiseError(
+                f"there can be 1 to 1000 bodies, got {self.count}", "BodyShapes", code="out-of-range"
+            )
         if not 0.5 <= self.low <= self.high <= 2.0:
             raise PoiseError(
-                f"sizes must rise within 0.5 to 2, got {self.low:g} to {self.high:g}", "BodyShapes"
+                f"sizes must rise within 0.5 to 2, got {self.low:g} to {self.high:g}",
+                "BodyShapes",
+                code="not-rising",
             )
         if not 0 <= self.per_clip <= self.count:
             raise PoiseError(
-                f"a clip can be done on 1 to {self.count} bodies, got {self.per_clip}", "BodyShapes"
+                f"a clip can be done on 1 to {self.count} bodies, got {self.per_clip}",
+                "BodyShapes",
+                code="out-of-range",
             )
 
     @property
@@ -194,7 +202,9 @@ def _finished(
     task = make_task(bodies[0])
     if not any(term.fn is obs.shape for term in task.obs):
         raise PoiseError(
-            f"a policy for {len(bodies)} bodies must observe them", hint="Set Perpetual(shape=True)"
+            f"a policy for {len(bodies)} bodies must observe them",
+            hint="Set Perpetual(shape=True)",
+            code="settings-conflict",
         )
     return replace(imitation, library=library, humanoid=bodies[0], reference=reference, task=task)
 

@@ -179,16 +179,20 @@ def read_score(path: str | Path) -> ScoreCard:
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))
     except OSError as problem:
-        raise PoiseError(f"cannot be read: {problem.strerror}", path) from None
+        raise PoiseError(f"cannot be read: {problem.strerror}", path, code="file-unreadable") from None
     except json.JSONDecodeError as problem:
-        raise PoiseError(f"is no JSON: {problem.msg}", f"{path}, line {problem.lineno}") from None
+        raise PoiseError(
+            f"is no JSON: {problem.msg}", f"{path}, line {problem.lineno}", code="bad-json"
+        ) from None
     if not isinstance(raw, dict):
-        raise PoiseError("is no score card: the file must hold one JSON object", path)
+        raise PoiseError(
+            "is no score card: the file must hold one JSON object", path, code="not-a-score-card"
+        )
     # A figure that is newer than the file has its default.
     told = [f for f in fields(ScoreCard) if f.name in raw or f.default is MISSING]
     _require(raw, [f.name for f in told if f.default_factory is MISSING], path)
     if not isinstance(raw["help"], dict):
-        raise PoiseError("is no score card: 'help' must be an object", path)
+        raise PoiseError("is no score card: 'help' must be an object", path, code="not-a-score-card")
     _require(raw["help"], [f.name for f in fields(Help)], path)
     values: dict[str, Any] = {f.name: _numbers(raw[f.name]) for f in told if f.name in raw}
     aid: dict[str, Any] = {f.name: _numbers(raw["help"][f.name]) for f in fields(Help)}
@@ -205,6 +209,7 @@ def _require(raw: dict[str, Any], names: list[str], path: Path) -> None:
             f"the score card lacks the key '{missing[0]}'",
             path,
             "Score the run again with this version.",
+            code="key-missing",
         )
 
 

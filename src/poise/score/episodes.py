@@ -66,6 +66,7 @@ def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observer
             f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, and the task has "
             f"{env.num_obs} and {env.num_actions}",
             hint="It was trained for other observations, actions, or another body",
+            code="policy-unfit",
         )
     for observer in observers:
         observer.see(env, 0)
@@ -167,7 +168,9 @@ def run_episodes(
     """
     if clip.shape != start.shape or clip.ndim != 1 or not len(clip):
         shapes = f"{tuple(clip.shape)} and {tuple(start.shape)}"
-        raise PoiseError(f"an evaluation needs clip and start of one length, got {shapes}")
+        raise PoiseError(
+            f"an evaluation needs clip and start of one length, got {shapes}", code="count-differs"
+        )
     env = make_env(len(clip))
     try:
         obs = env.reset_to(clip, start)
@@ -418,7 +421,12 @@ class Transitions:
         """
         path = Path(path)
         if path.suffix != ".npz":
-            raise PoiseError("rollouts are written as .npz", path, "Choose a name that ends in .npz")
+            raise PoiseError(
+                "rollouts are written as .npz",
+                path,
+                "Choose a name that ends in .npz",
+                code="wrong-suffix",
+            )
         arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, poise_transitions=np.array(VERSION), **arrays)  # type: ignore[arg-type]
@@ -447,7 +455,7 @@ def record_transitions(
         cycles: rounds of a cyclic clip, after which an episode is cut off.
     """
     if not noise >= 0:
-        raise PoiseError(f"noise must be at least 0, got {noise:g}")
+        raise PoiseError(f"noise must be at least 0, got {noise:g}", code="out-of-range")
     env, rng = make_env(len(clip)), torch.Generator().manual_seed(seed)
     columns: dict[str, list[Tensor]] = {}
     try:

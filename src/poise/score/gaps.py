@@ -58,7 +58,9 @@ class Protocol:
         try:
             return bank.only(lambda name: self.part_of(name) == part)
         except PoiseError as error:
-            raise PoiseError(f"{self.name} has no clips for '{part}': {error.what}") from None
+            raise PoiseError(
+                f"{self.name} has no clips for '{part}': {error.what}", code=error.code
+            ) from None
 
 
 #: Subject 5 is the published test set; there is no validation set.
@@ -131,7 +133,10 @@ def test_set(held_out: FrameBank, statistics: Tensor, protocol: Protocol) -> Tes
     """
     starts = window_starts(held_out.first, protocol.test_window, protocol.test_offset)
     if not len(starts):
-        raise PoiseError(f"no clip of {protocol.name} has more than {protocol.test_window} frames")
+        raise PoiseError(
+            f"no clip of {protocol.name} has more than {protocol.test_window} frames",
+            code="clip-too-short",
+        )
     root, rot, offsets = cut(held_out, starts, protocol.test_window)
     root, rot = faced(centred(root), rot, held_out.facing, protocol.past - 1)
     pos, quat = forward_kinematics(held_out.parents, offsets, root, rot)

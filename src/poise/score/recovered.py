@@ -121,14 +121,26 @@ def recovery_card(
     unknown = [k for k in kinds if k not in KINDS]
     if unknown or not kinds or trials < 1 or not seconds:
         what = f"there is no fail-state '{unknown[0]}'" if unknown else "nothing is asked for"
-        raise PoiseError(what, "recovery", f"Fail-states are {', '.join(KINDS)}")
+        raise PoiseError(
+            what,
+            "recovery",
+            f"Fail-states are {', '.join(KINDS)}",
+            code="unknown-fall-state" if unknown else "argument-missing",
+        )
     env = make_env(min(trials, at_once))
     try:
         clock = env.plugin(RecoveryClock)
         if clock is None or env.task.auto_reset:
-            raise PoiseError("the task is none for trials of recovery", hint="Make it with trial_task")
+            raise PoiseError(
+                "the task is none for trials of recovery",
+                hint="Make it with trial_task",
+                code="task-unfit",
+            )
         if not 0 <= clip < len(env.reference.names):
-            raise PoiseError(f"there is no clip {clip}, they are 0 to {len(env.reference.names) - 1}")
+            raise PoiseError(
+                f"there is no clip {clip}, they are 0 to {len(env.reference.names) - 1}",
+                code="index-outside",
+            )
         env.reseed(seed)
         clock.drop_anew(seed)
         rate, rows = env.reference.rate_hz, []

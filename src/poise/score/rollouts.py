@@ -79,7 +79,9 @@ class RolloutSet:
     def __post_init__(self) -> None:
         if self.pos.ndim != 4 or self.pos.shape[-1] != 3 or 0 in self.pos.shape:
             raise PoiseError(
-                f"pos must be (E, T, B, 3) and not empty, got {tuple(self.pos.shape)}", "rollouts"
+                f"pos must be (E, T, B, 3) and not empty, got {tuple(self.pos.shape)}",
+                "rollouts",
+                code="wrong-shape",
             )
         episodes, frames, bodies, _ = self.pos.shape
         helped = self.force.shape[2] if self.force.ndim == 4 else 1
@@ -101,11 +103,15 @@ class RolloutSet:
             _check_shape(f"reward['{name}']", values, (episodes, frames))
         if self.reward and "total" not in self.reward:
             raise PoiseError(
-                f"the reward has no 'total' beside its terms {sorted(self.reward)}", "rollouts"
+                f"the reward has no 'total' beside its terms {sorted(self.reward)}",
+                "rollouts",
+                code="key-missing",
             )
         for name in ("fps", "mass"):
             if not 0 < getattr(self, name) < float("inf"):
-                raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "rollouts")
+                raise PoiseError(
+                    f"{name} must be above 0, got {getattr(self, name)}", "rollouts", code="out-of-range"
+                )
         if self.clip_names and not 0 <= int(self.clip.min()) <= int(self.clip.max()) < len(
             self.clip_names
         ):
@@ -113,6 +119,7 @@ class RolloutSet:
                 f"clip holds indices {int(self.clip.min())} to {int(self.clip.max())}, "
                 f"but there are {len(self.clip_names)} clip names",
                 "rollouts",
+                code="index-outside",
             )
 
     @property
@@ -134,7 +141,9 @@ class RolloutSet:
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
     if tuple(value.shape) != shape:
-        raise PoiseError(f"{name} must be {shape}, got {tuple(value.shape)}", "rollouts")
+        raise PoiseError(
+            f"{name} must be {shape}, got {tuple(value.shape)}", "rollouts", code="wrong-shape"
+        )
 
 
 class Judged(NamedTuple):

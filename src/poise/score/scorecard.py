@@ -187,14 +187,16 @@ def score_rollouts(
         seconds, samples, seed: wall-clock time, control steps and seed of the training that made it.
     """
     if weighting not in ("frame", "episode"):
-        raise PoiseError(f"the weighting must be 'frame' or 'episode', got '{weighting}'")
+        raise PoiseError(
+            f"the weighting must be 'frame' or 'episode', got '{weighting}'", code="unknown-choice"
+        )
     chosen, parts, first = success_rule(rule), [], None
     for r in [rollouts] if isinstance(rollouts, RolloutSet) else rollouts:
         parts.append(_part(r, chosen))
         # What all parts share, without the frames.
         first = first or (r.clip_names, r.fps, r.mass, (float(r.limit_n), float(r.limit_nm)))
     if first is None:
-        raise PoiseError("there are no rollouts to score")
+        raise PoiseError("there are no rollouts to score", code="no-rollouts")
     (names, fps, mass, limits), p = first, _joined(parts)
     everyone = torch.ones_like(p.won)
     force, torque, point_vel, ang_vel = p.wrench

@@ -78,6 +78,7 @@ class SimState:
             raise PoiseError(
                 f"the state field '{name}' is not bound",
                 hint=f"Call state.bind(['{name}']) first. {did_you_mean(name, list(self._views))}",
+                code="field-unbound",
             )
         return self._views[name]
 
@@ -250,13 +251,19 @@ class SimConfig:
             value = getattr(self, name)
             if value not in known:
                 hint = did_you_mean(value, list(known))
-                raise PoiseError(f"unknown {name} '{value}'", "SimConfig", hint)
+                raise PoiseError(f"unknown {name} '{value}'", "SimConfig", hint, code="unknown-choice")
         for name in ("rate_hz", "control_hz", "iterations", "ls_iterations", "tolerance"):
             value = getattr(self, name)
             if not 0 < value < float("inf"):
-                raise PoiseError(f"{name} must be above 0, got {value}", "SimConfig")
+                raise PoiseError(
+                    f"{name} must be above 0, got {value}", "SimConfig", code="out-of-range"
+                )
             if value > MOST[name]:
-                raise PoiseError(f"{name} must be at most {MOST[name]:g}, got {value:g}", "SimConfig")
+                raise PoiseError(
+                    f"{name} must be at most {MOST[name]:g}, got {value:g}",
+                    "SimConfig",
+                    code="out-of-range",
+                )
         ratio = self.rate_hz / self.control_hz
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             nearest = max(1, round(ratio)) * self.control_hz
@@ -265,6 +272,7 @@ class SimConfig:
                 f"physics and {self.control_hz:g} Hz control give {ratio:.4g}",
                 "SimConfig",
                 f"With {self.control_hz:g} Hz control, use for example rate_hz={nearest:g}.",
+                code="not-a-multiple",
             )
 
     @property

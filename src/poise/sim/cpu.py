@@ -34,7 +34,7 @@ class CpuBackend(Worlds):
         self, spec_or_model: mujoco.MjSpec | mujoco.MjModel, num_envs: int, threads: int = 0
     ) -> None:
         if threads < 0:
-            raise PoiseError(f"threads must not be below 0, got {threads}")
+            raise PoiseError(f"threads must not be below 0, got {threads}", code="out-of-range")
         super().__init__(compile_model(spec_or_model), num_envs, torch.device("cpu"))
         self._batch: Batch | None = Batch(self._model, num_envs, min(threads, num_envs))
         self._rows = torch.from_numpy(self._live.state)
@@ -111,6 +111,7 @@ class CpuBackend(Worlds):
             raise PoiseError(
                 f"'{field}' is not a model field that can differ between worlds",
                 hint=did_you_mean(field, sorted(MODEL_FIELDS)),
+                code="unknown-field",
             )
         return torch.from_numpy(self._live.expand(field))
 
@@ -138,7 +139,7 @@ class CpuBackend(Worlds):
     @property
     def _live(self) -> Batch:
         if self._batch is None:
-            raise PoiseError("the backend is closed")
+            raise PoiseError("the backend is closed", code="backend-closed")
         return self._batch
 
     def _views(self, names: list[str]) -> dict[str, Tensor]:
@@ -153,6 +154,7 @@ class CpuBackend(Worlds):
             raise PoiseError(
                 f"'{name}' is not a MuJoCo data field that can be bound",
                 hint=did_you_mean(name, sorted(DATA_FIELDS)),
+                code="unknown-field",
             )
         array = self._live.bind(name)
         if array.flags.writeable:
@@ -180,5 +182,5 @@ class CpuBackend(Worlds):
         except SimulationError as error:
             raise PoiseError(
                 f"MuJoCo failed in {call}: {error}", f"worlds {error.ids.tolist()[:8]}",
-                "These worlds kept their state from before the call.",
+                "These worlds kept their state from before the call.", code="physics-failed",
             ) from error  # fmt: skip

@@ -42,7 +42,8 @@ class Drive:
         if [len(s) for s in shapes] != [2, 2, 3] or shapes[2][2] != 6 or {s[0] for s in shapes} != {n}:
             raise PoiseError(
                 "a Drive needs ctrl (N, nu), qfrc_applied (N, nv) and xfrc_applied (N, nbody, 6), got "
-                f"{shapes[0]}, {shapes[1]} and {shapes[2]}"
+                f"{shapes[0]}, {shapes[1]} and {shapes[2]}",
+                code="wrong-shape",
             )
 
     @classmethod

@@ -64,11 +64,15 @@ class Steps:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= 100:
-            raise PoiseError(f"stairs have 1 to 100 steps, got {self.count}", "Steps")
+            raise PoiseError(
+                f"stairs have 1 to 100 steps, got {self.count}", "Steps", code="out-of-range"
+            )
         for name in ("rise", "tread", "width", "landing"):
             if not 0.0 < getattr(self, name) < 100.0:
                 raise PoiseError(
-                    f"{name} must lie between 0 and 100 m, got {getattr(self, name)}", "Steps"
+                    f"{name} must lie between 0 and 100 m, got {getattr(self, name)}",
+                    "Steps",
+                    code="out-of-range",
                 )
 
     def add(self, spec: mujoco.MjSpec, friction: float) -> None:
@@ -104,11 +108,19 @@ class HeightField:
     def __post_init__(self) -> None:
         h = self.heights
         if h.ndim != 2 or min(h.shape) < 2:
-            raise PoiseError(f"heights must be a grid of at least 2 by 2, got {h.shape}", "HeightField")
+            raise PoiseError(
+                f"heights must be a grid of at least 2 by 2, got {h.shape}",
+                "HeightField",
+                code="wrong-shape",
+            )
         if not np.isfinite(h).all() or h.min() < 0.0:
-            raise PoiseError("heights must be finite and at least 0 m", "HeightField")
+            raise PoiseError(
+                "heights must be finite and at least 0 m", "HeightField", code="out-of-range"
+            )
         if not min(self.size) > 0.0:
-            raise PoiseError(f"its size must be above 0 m, got {self.size}", "HeightField")
+            raise PoiseError(
+                f"its size must be above 0 m, got {self.size}", "HeightField", code="out-of-range"
+            )
 
     def add(self, spec: mujoco.MjSpec, friction: float) -> None:
         """Adds one geom "floor"."""

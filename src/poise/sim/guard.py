@@ -194,7 +194,7 @@ class UnstableError(PoiseError):
         if len(failures) > 1:
             what += f" ({len(failures)} environments failed in this step)"
         dumped = f" Replay it with poise.sim.replay_dump('{first.dump}')." if first.dump else ""
-        super().__init__(what, first.place, first.cause.hint + dumped)
+        super().__init__(what, first.place, first.cause.hint + dumped, code="unstable")
 
 
 class NanGuard:
@@ -225,7 +225,9 @@ class NanGuard:
         max_dumps: int = 4,
     ) -> None:
         if not speed_limit > 0:
-            raise PoiseError(f"speed_limit must be above 0, got {speed_limit}", "NanGuard")
+            raise PoiseError(
+                f"speed_limit must be above 0, got {speed_limit}", "NanGuard", code="out-of-range"
+            )
         self.backend, self.speed_limit, self.seed = backend, float(speed_limit), seed
         self.folder = None if folder is None else Path(folder)
         self.where, self.max_dumps = where, max_dumps
@@ -313,17 +315,17 @@ def replay_dump(path: str | Path) -> Replay:
     """Run the failing step of a dump again, in one world, and say what happens."""
     path = Path(path)
     if not path.is_file():
-        raise PoiseError("there is no such dump", path)
+        raise PoiseError("there is no such dump", path, code="file-missing")
     with safe_open(path, framework="np") as file:
         if "model" not in file.keys():  # noqa: SIM118
-            raise PoiseError("this file is not a dump of the NaN guard", path)
+            raise PoiseError("this file is not a dump of the NaN guard", path, code="wrong-file-kind")
         info = json.loads(file.metadata()["info"])
         model_bytes = file.get_tensor("model").tobytes()
         before, after = file.get_tensor("before"), file.get_tensor("after")
     if info["mujoco"] != mujoco.__version__:
         raise PoiseError(
             f"the dump was made by MuJoCo {info['mujoco']}, this is {mujoco.__version__}", path,
-            f"Install mujoco=={info['mujoco']} to replay it.",
+            f"Install mujoco=={info['mujoco']} to replay it.", code="version-differs",
         )  # fmt: skip
     model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": model_bytes})
     nstep = int(info["nstep"])

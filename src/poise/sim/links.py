@@ -49,11 +49,23 @@ class Link:
 
     def __post_init__(self) -> None:
         if self.a == self.b:
-            raise PoiseError(f"a link joins two bodies, got '{self.a}' twice", f"Link '{self.name}'")
+            raise PoiseError(
+                f"a link joins two bodies, got '{self.a}' twice",
+                f"Link '{self.name}'",
+                code="name-repeated",
+            )
         if self.kind not in ("weld", "ball"):
-            raise PoiseError(f"a link is a weld or a ball, got '{self.kind}'", f"Link '{self.name}'")
+            raise PoiseError(
+                f"a link is a weld or a ball, got '{self.kind}'",
+                f"Link '{self.name}'",
+                code="unknown-choice",
+            )
         if self.kind == "weld" and self.to is not None:
-            raise PoiseError("a weld keeps bodies as they are, it has no `to`", f"Link '{self.name}'")
+            raise PoiseError(
+                "a weld keeps bodies as they are, it has no `to`",
+                f"Link '{self.name}'",
+                code="settings-conflict",
+            )
 
     @property
     def hook(self) -> str:
@@ -154,5 +166,7 @@ def _slice(name: str, rows: np.ndarray) -> slice:
     if not len(rows):
         return slice(0, 0)
     if not (np.diff(rows) == 1).all():
-        raise PoiseError(f"MuJoCo does not number what belongs to '{name}' side by side", "Scene")
+        raise PoiseError(
+            f"MuJoCo does not number what belongs to '{name}' side by side", "Scene", code="rows-apart"
+        )
     return slice(int(rows[0]), int(rows[-1]) + 1)

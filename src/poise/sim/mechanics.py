@@ -30,7 +30,9 @@ class Mechanics:
         self.backend, model, here = backend, backend.model, backend.device
         backend.state.bind(["cdof", "M"] if inertia else ["cdof"])
         if inertia and backend.state["M"].shape[1:] != (model.nC,):
-            raise PoiseError("this backend keeps its inertia in another form", "Mechanics")
+            raise PoiseError(
+                "this backend keeps its inertia in another form", "Mechanics", code="physics-unsupported"
+            )
         self._moves = torch.from_numpy(_ancestors(model)).to(here)
         # (-[arm] 1) `(3, 6)` as one row: what is fixed in it, and what the arm adds.
         fixed, cross = np.zeros((3, 6)), np.zeros((3, 3, 6))
@@ -64,7 +66,9 @@ class Mechanics:
         index, point = self._index(body), point_w[:, None] if single else point_w
         if point.shape != (n, index.shape[1], 3):
             want = (n, 3) if single else (n, index.shape[1], 3)
-            raise PoiseError(f"points must be {want}, got {tuple(point_w.shape)}", "jacobian")
+            raise PoiseError(
+                f"points must be {want}, got {tuple(point_w.shape)}", "jacobian", code="wrong-shape"
+            )
         centre = state.subtree_com.gather(1, self._root[index][..., None].expand(-1, -1, 3))
         arm = point.to(centre) - centre
         # Each degree of freedom turns and moves the tree about its centre of mass, see `SimState.cvel`;
@@ -80,7 +84,11 @@ class Mechanics:
         index = (index.reshape(1) if isinstance(body, int) else index).expand(self.backend.num_envs, -1)
         if bool(((index < 0) | (index >= self.backend.model.nbody)).any()):
             most = self.backend.model.nbody - 1
-            raise PoiseError(f"bodies must be in 0 to {most}, got {index.unique().tolist()}", "jacobian")
+            raise PoiseError(
+                f"bodies must be in 0 to {most}, got {index.unique().tolist()}",
+                "jacobian",
+                code="index-outside",
+            )
         return index
 
     def inertia(self) -> Tensor:
@@ -98,7 +106,9 @@ class Mechanics:
         nv = self.backend.model.nv
         if force.shape[:2] != (self.backend.num_envs, nv):
             want = f"({self.backend.num_envs}, {nv}, ...)"
-            raise PoiseError(f"forces must be {want}, got {tuple(force.shape)}", "solve")
+            raise PoiseError(
+                f"forces must be {want}, got {tuple(force.shape)}", "solve", code="wrong-shape"
+            )
         factor = torch.linalg.cholesky(self.inertia())
         wide = force.to(factor) if force.dim() == 3 else force.to(factor)[..., None]
         out = torch.cholesky_solve(wide, factor)
@@ -114,7 +124,9 @@ class Mechanics:
         backend, applied = self.backend, self.backend.drive.qfrc_applied
         if force.shape != applied.shape:
             want = tuple(applied.shape)
-            raise PoiseError(f"forces must be {want}, got {tuple(force.shape)}", "step_map")
+            raise PoiseError(
+                f"forces must be {want}, got {tuple(force.shape)}", "step_map", code="wrong-shape"
+            )
         before, reached = backend.snapshot(), list[Tensor]()
         for extra in (None, force):
             if extra is not None:

@@ -51,7 +51,7 @@ def above_zero(where: str, **values: float | Sequence[float]) -> None:
     for name, value in values.items():
         numbers = value if isinstance(value, Sequence) else (value,)
         if not all(0.0 < x < float("inf") for x in numbers):
-            raise PoiseError(f"{name} must be above 0, got {value}", where)
+            raise PoiseError(f"{name} must be above 0, got {value}", where, code="out-of-range")
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ class Mesh:
         if self.mass != 0.0:
             above_zero(f"Mesh '{self.name}'", mass=self.mass)
         if not Path(self.path).is_file():
-            raise PoiseError("there is no such file", str(self.path))
+            raise PoiseError("there is no such file", str(self.path), code="file-missing")
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds the mesh and one body.
@@ -271,12 +271,14 @@ class Mesh:
             model = alone.compile()
         except ValueError as problem:
             text = " ".join(str(problem).split()).removeprefix("Error: ")
-            raise PoiseError(f"the mesh cannot be used: {text}", str(self.path)) from None
+            raise PoiseError(
+                f"the mesh cannot be used: {text}", str(self.path), code="mesh-unusable"
+            ) from None
         holes = _open_edges(model.mesh_vert, model.mesh_face)
         if holes:
             raise PoiseError(
                 f"the mesh is not closed: {holes} of its edges have no two faces", str(self.path),
-                "Fill its holes, or use a box",
+                "Fill its holes, or use a box", code="mesh-unusable",
             )  # fmt: skip
         spec.add_mesh(name=self.name, file=str(Path(self.path).resolve()))
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), quat=list(self.quat))

@@ -85,13 +85,20 @@ class Scene:
 
     def __post_init__(self) -> None:
         if len(self.things) > MOST:
-            raise PoiseError(f"a scene holds at most {MOST} things, got {len(self.things)}", "Scene")
+            raise PoiseError(
+                f"a scene holds at most {MOST} things, got {len(self.things)}",
+                "Scene",
+                code="over-limit",
+            )
         for what in ("things", "links", "touches"):
             names = [x.name for x in getattr(self, what)]
             twice = next((n for n in names if names.count(n) > 1), None)
             if twice is not None:
                 raise PoiseError(
-                    f"two of its {what} are called '{twice}'", "Scene", "Give each its name"
+                    f"two of its {what} are called '{twice}'",
+                    "Scene",
+                    "Give each its name",
+                    code="name-repeated",
                 )
 
     @property
@@ -132,7 +139,9 @@ class Scene:
             model = self.spec.compile()
         except ValueError as problem:
             text = " ".join(str(problem).split()).removeprefix("Error: ")
-            raise PoiseError(f"the scene cannot be compiled: {text}", "Scene") from None
+            raise PoiseError(
+                f"the scene cannot be compiled: {text}", "Scene", code="model-not-compiled"
+            ) from None
         first = {t.name: self._first_body(t) for t in self.things}
         return SceneModel(
             self, model, {n: place_of(model, n, model.body(body).id) for n, body in first.items()}
@@ -149,6 +158,7 @@ class Scene:
                 "the force between two characters' bodies is not measured",
                 f"Link '{link.name}'",
                 "Put a prop between them, linked to both",
+                code="force-not-measured",
             )
         return free[0]
 
@@ -188,7 +198,12 @@ def alone(humanoid: Humanoid, sim: SimConfig | None = None) -> mujoco.MjModel:
 
 def _check(name: str, known: list[str], where: str) -> None:
     if name not in known:
-        raise PoiseError(f"there is no body '{name}' in the scene", where, did_you_mean(name, known))
+        raise PoiseError(
+            f"there is no body '{name}' in the scene",
+            where,
+            did_you_mean(name, known),
+            code="unknown-body",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,5 +224,5 @@ class SceneModel:
         """Where a thing stands in the model's arrays."""
         if name not in self.places:
             hint = did_you_mean(name, list(self.places))
-            raise PoiseError(f"there is no '{name}' in the scene", "Scene", hint)
+            raise PoiseError(f"there is no '{name}' in the scene", "Scene", hint, code="unknown-thing")
         return self.places[name]

@@ -167,7 +167,8 @@ class CharacterRows:
         short = sum(sizes[name] for name in _OWN)
         if tuple(snapshot.shape) not in ((n, sum(sizes.values())), (n, short)):
             raise PoiseError(
-                f"the snapshot has shape {tuple(snapshot.shape)}, not that of {n} characters"
+                f"the snapshot has shape {tuple(snapshot.shape)}, not that of {n} characters",
+                code="snapshot-differs",
             )
         derived = snapshot.shape[1] != short
         names = self._names(derived)
@@ -182,6 +183,7 @@ class CharacterRows:
         raise PoiseError(
             f"'{field}' belongs to the whole world",
             hint="Give the scene's characters bodies of their own",
+            code="field-of-world",
         )
 
     def set_const(self, rows: Tensor | None = None) -> None:
@@ -254,7 +256,7 @@ class CharacterRows:
             return _Field([whole[:, int(a) : int(b)] for a, b in spans])
         if name.startswith(_DOFS):
             return _Field([whole[:, p.dofs] for p in self.places])
-        raise PoiseError(f"the state field '{name}' is not known per character")
+        raise PoiseError(f"the state field '{name}' is not known per character", code="field-of-world")
 
 
 #: m; things that begin deeper in one another are a mistake.
@@ -330,13 +332,17 @@ class SceneSim:
                     f"there is no character '{name}' in the scene",
                     "Scene",
                     did_you_mean(name, list(known)),
+                    code="unknown-thing",
                 )
         chosen = names or tuple(known)
         bodies = {known[n].identity for n in chosen}
         if len(bodies) != 1:
             what = f"characters of {len(bodies)} bodies" if bodies else "a scene without characters"
             raise PoiseError(
-                f"{what} cannot share rows", "Scene", "Ask for each body's characters by name"
+                f"{what} cannot share rows",
+                "Scene",
+                "Ask for each body's characters by name",
+                code="bodies-differ",
             )
         own = alone(known[chosen[0]], self.scene.scene.sim)
         places = [self.scene.place(n) for n in chosen]
@@ -354,10 +360,11 @@ class SceneSim:
         if tuple(qpos.shape) != (n, wide[0]) or tuple(qvel.shape) != (n, wide[1]):
             raise PoiseError(
                 f"'{name}' needs qpos ({n}, {wide[0]}) and qvel ({n}, {wide[1]}), got "
-                f"{tuple(qpos.shape)} and {tuple(qvel.shape)}"
+                f"{tuple(qpos.shape)} and {tuple(qvel.shape)}",
+                code="wrong-shape",
             )
         if not bool(qpos.isfinite().all() and qvel.isfinite().all()):
-            raise PoiseError(f"the state of '{name}' is not finite", "SceneSim.place")
+            raise PoiseError(f"the state of '{name}' is not finite", "SceneSim.place", code="not-finite")
         state.qpos[to, place.qpos] = qpos.to(state.qpos)
         state.qvel[to, place.dofs] = qvel.to(state.qvel)
         self.backend.forward(rows)
@@ -373,7 +380,12 @@ class SceneSim:
         """
         links = {link.name: i for i, link in enumerate(self.scene.scene.links)}
         if name not in links:
-            raise PoiseError(f"there is no link '{name}'", "Scene", did_you_mean(name, list(links)))
+            raise PoiseError(
+                f"there is no link '{name}'",
+                "Scene",
+                did_you_mean(name, list(links)),
+                code="unknown-link",
+            )
         i, link = links[name], self.scene.scene.links[links[name]]
         model, state = self.scene.model, self.backend.state
         to = torch.arange(self.num_envs, device=self.backend.device) if rows is None else rows
@@ -409,10 +421,19 @@ class SceneSim:
         """What a measured link exerts."""
         links = {link.name: link for link in self.scene.scene.links}
         if name not in links:
-            raise PoiseError(f"there is no link '{name}'", "Scene", did_you_mean(name, list(links)))
+            raise PoiseError(
+                f"there is no link '{name}'",
+                "Scene",
+                did_you_mean(name, list(links)),
+                code="unknown-link",
+            )
         link, model, state = links[name], self.scene.model, self.backend.state
         if not link.measured:
-            raise PoiseError(f"the force of link '{name}' is not measured", hint="Link(measured=True)")
+            raise PoiseError(
+                f"the force of link '{name}' is not measured",
+                hint="Link(measured=True)",
+                code="force-not-measured",
+            )
         body, site = model.body(link.hook).id, model.site(link.hook).id
         ends = [model.eq_obj1id, model.eq_obj2id]
         # The sensor has what the body exerts on the hook, so minus what the link does; and where the
@@ -427,7 +448,9 @@ class SceneSim:
         """What is measured of a touch."""
         known = [t.name for t in self.scene.scene.touches]
         if name not in known:
-            raise PoiseError(f"there is no touch '{name}'", "Scene", did_you_mean(name, known))
+            raise PoiseError(
+                f"there is no touch '{name}'", "Scene", did_you_mean(name, known), code="unknown-link"
+            )
         sensor = self.scene.model.sensor(name)
         at, state = int(sensor.adr[0]), self.backend.state["sensordata"]
         count, force, torque, point = state[:, at : at + 10].split((1, 3, 3, 3), 1)
@@ -444,7 +467,7 @@ class SceneSim:
                     names = [self._thing(x) for x in (a, b)]
                     raise PoiseError(
                         f"{names[0]} and {names[1]} begin {-1000 * contact.dist:.0f} mm in one another",
-                        f"world {env}", "Move one of them",
+                        f"world {env}", "Move one of them", code="bodies-overlap",
                     )  # fmt: skip
 
     def step(self, nstep: int = 1) -> None:
@@ -497,4 +520,5 @@ class SceneSim:
         raise PoiseError(
             f"the bodies of link '{name}' are {far:.2f} m apart, and {FAR_M} m is the most",
             hint="Bring them together before you switch it on",
+            code="too-far",
         )

@@ -38,11 +38,14 @@ class WarpModel:
             raise PoiseError(
                 "the GPU backend steps with the integrators discrete, implicitfast and euler, not RK4",
                 hint="Set SimConfig.integrator.",
+                code="physics-unsupported",
             )
         try:
             self.m: Any = mjw.put_model(model)
         except (RuntimeError, ValueError) as error:
-            raise PoiseError(f"mujoco-warp cannot run this model: {error}") from error
+            raise PoiseError(
+                f"mujoco-warp cannot run this model: {error}", code="physics-unsupported"
+            ) from error
         self.m.opt.warn_overflow = 0  # The backend raises instead of printing.
         self.m.opt.deterministic = deterministic
         # The solver stops when all worlds have converged: in a CUDA graph by a conditional node, which
@@ -61,6 +64,7 @@ class WarpModel:
             raise PoiseError(
                 f"'{field}' is not a model field that can differ between worlds",
                 hint=did_you_mean(field, known),
+                code="unknown-field",
             )
         old: Any = self._shared_array(field)
         new = self._wp.empty((self._num_envs, *old.shape[1:]), dtype=old.dtype, device=old.device)
@@ -283,7 +287,7 @@ class WarpBackend(Worlds):
     @property
     def _live(self) -> Any:
         if self._d is None:
-            raise PoiseError("the backend is closed")
+            raise PoiseError("the backend is closed", code="backend-closed")
         return self._d
 
     @contextmanager
@@ -303,7 +307,9 @@ class WarpBackend(Worlds):
                 self._model, n, nconmax=room.contacts, njmax=room.rows, nccdmax=room.convex
             )
         except (RuntimeError, MemoryError) as error:
-            raise PoiseError(f"{self._device} has no room for {n} worlds: {error}") from error
+            raise PoiseError(
+                f"{self._device} has no room for {n} worlds: {error}", code="out-of-memory"
+            ) from error
 
     def _check_room(self) -> None:
         per_world = bytes_per_world(self._model, self._room)
@@ -375,11 +381,13 @@ class WarpBackend(Worlds):
             raise PoiseError(
                 f"{rows} constraint rows do not fit into the {self._room.rows} set aside",
                 f"world {world}", "Make the WarpBackend with a larger constraints_per_world.",
+                code="over-capacity",
             )  # fmt: skip
         raise PoiseError(
             f"the worlds have more contacts than the {self._room.contacts} per world set aside "
             f"({kinds(flag).name})",
             f"world {world}", "Make the WarpBackend with a larger contacts_per_world.",
+            code="over-capacity",
         )  # fmt: skip
 
     def _rows(self, rows: Tensor | None) -> Tensor | slice:
@@ -410,7 +418,9 @@ class WarpBackend(Worlds):
         if name not in _BINDABLE:
             known: list[str] = sorted(_BINDABLE)
             raise PoiseError(
-                f"'{name}' is not a MuJoCo data field that can be bound", hint=did_you_mean(name, known)
+                f"'{name}' is not a MuJoCo data field that can be bound",
+                hint=did_you_mean(name, known),
+                code="unknown-field",
             )
         if name in self._states:
             return self._states[name]

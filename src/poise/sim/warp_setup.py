@@ -34,6 +34,7 @@ def load_warp() -> tuple[ModuleType, ModuleType]:
         raise PoiseError(
             f"the GPU backend needs mujoco-warp, which cannot be imported ({error})",
             hint="Install the extra: pip install 'poise-motion[gpu]'.",
+            code="extra-missing",
         ) from error
     check_versions(metadata.version("mujoco-warp"), mujoco.__version__)
     if warp.config.log_level == warp.LOG_INFO:
@@ -48,6 +49,7 @@ def check_versions(mujoco_warp: str, mujoco_core: str) -> None:
         raise PoiseError(
             f"mujoco-warp {mujoco_warp} and mujoco {mujoco_core} do not go together",
             hint="Install both from one release series: pip install -U 'poise-motion[gpu]'.",
+            code="version-differs",
         )
 
 
@@ -56,16 +58,24 @@ def resolve_device(name: str | torch.device) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError as error:
-        raise PoiseError(f"unknown device '{name}'", hint="Use 'cpu', 'cuda' or 'cuda:0'.") from error
+        raise PoiseError(
+            f"unknown device '{name}'", hint="Use 'cpu', 'cuda' or 'cuda:0'.", code="unknown-device"
+        ) from error
     if device.type not in ("cpu", "cuda"):
-        raise PoiseError(f"device '{name}' is not supported", hint="Use 'cpu', 'cuda' or 'cuda:0'.")
+        raise PoiseError(
+            f"device '{name}' is not supported",
+            hint="Use 'cpu', 'cuda' or 'cuda:0'.",
+            code="unknown-device",
+        )
     if device.type == "cpu":
         return device
     check_torch_cuda(name, torch.version.cuda, torch.cuda.device_count())
     index = torch.cuda.current_device() if device.index is None else device.index
     if index >= torch.cuda.device_count():
         raise PoiseError(
-            f"there is no device '{name}'", hint=f"This machine has {torch.cuda.device_count()} GPU(s)."
+            f"there is no device '{name}'",
+            hint=f"This machine has {torch.cuda.device_count()} GPU(s).",
+            code="device-missing",
         )
     warp, _ = load_warp()
     warp.init()
@@ -82,11 +92,13 @@ def check_torch_cuda(name: str | torch.device, built_for: str | None, count: int
         raise PoiseError(
             f"device '{name}' was asked for, but this PyTorch ({torch.__version__}) has no CUDA",
             hint="Install a CUDA build of PyTorch (pytorch.org), or use --device cpu.",
+            code="device-missing",
         )
     if count == 0:
         raise PoiseError(
             f"device '{name}' was asked for, but PyTorch finds no CUDA GPU",
             hint="Check that `nvidia-smi` lists one, or use --device cpu.",
+            code="device-missing",
         )
 
 
@@ -101,6 +113,7 @@ def check_driver(
     raise PoiseError(
         f"Warp {version} was built {built} and finds {has}, though PyTorch sees a GPU",
         hint="Update the NVIDIA driver, or install the warp-lang release that fits it.",
+        code="driver-unfit",
     )
 
 
@@ -127,7 +140,7 @@ def capacity(model: mujoco.MjModel, contacts: int | None = None, rows: int | Non
     """
     for name, value in (("contacts_per_world", contacts), ("constraints_per_world", rows)):
         if value is not None and value < 1:
-            raise PoiseError(f"{name} must be above 0, got {value}")
+            raise PoiseError(f"{name} must be above 0, got {value}", code="out-of-range")
     solid = (model.geom_contype | model.geom_conaffinity) != 0
     moving = solid & (model.body_weldid[model.geom_bodyid] != 0)
     count, fixed = int(moving.sum()), int((solid & ~moving).sum())
@@ -179,6 +192,7 @@ def check_memory(num_envs: int, per_world: int, free: int | None, device: torch.
         f"{num_envs} worlds of this model need about {num_envs * per_world / _GIB:.1f} GiB, but "
         f"{device} has {free / _GIB:.1f} GiB free",
         hint=f"About {fit} fit: ask for that many, or free some memory.",
+        code="out-of-memory",
     )
 
 

@@ -35,7 +35,11 @@ def add_contact_sensors(
         bodies = [b.name for b in spec.bodies if b.name and b.name != "world" and b.geoms]
     for name in [*bodies, *([against] if against else [])]:
         if name not in known:
-            raise PoiseError(f"there is no body '{name}' to sense", hint=did_you_mean(name, known))
+            raise PoiseError(
+                f"there is no body '{name}' to sense",
+                hint=did_you_mean(name, known),
+                code="unknown-body",
+            )
     for name in bodies:
         sensor = spec.add_sensor(
             name=f"contact_force/{name}", type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -64,7 +68,9 @@ def compile_model(spec_or_model: mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjMod
     try:
         return spec_or_model.compile()
     except ValueError as error:
-        raise PoiseError(f"MuJoCo cannot compile the model: {error}") from error
+        raise PoiseError(
+            f"MuJoCo cannot compile the model: {error}", code="model-not-compiled"
+        ) from error
 
 
 def check_state(model: mujoco.MjModel, n: int, qpos: Tensor, qvel: Tensor) -> None:
@@ -72,13 +78,16 @@ def check_state(model: mujoco.MjModel, n: int, qpos: Tensor, qvel: Tensor) -> No
     if qpos.shape != (n, model.nq) or qvel.shape != (n, model.nv):
         raise PoiseError(
             f"write needs qpos ({n}, {model.nq}) and qvel ({n}, {model.nv}), "
-            f"got {tuple(qpos.shape)} and {tuple(qvel.shape)}"
+            f"got {tuple(qpos.shape)} and {tuple(qvel.shape)}",
+            code="wrong-shape",
         )
     for name, value in (("qpos", qpos), ("qvel", qvel)):
         # A sum that is finite costs less than a mask and vouches for every number.
         if not math.isfinite(float(value.sum())) and not bool(value.isfinite().all()):
             row, column = torch.nonzero(~value.isfinite())[0].tolist()
-            raise PoiseError(f"{name} is not finite in row {row}, column {column}", "write")
+            raise PoiseError(
+                f"{name} is not finite in row {row}, column {column}", "write", code="not-finite"
+            )
 
 
 def row_index(rows: Tensor, num_envs: int) -> Tensor:
@@ -86,14 +95,19 @@ def row_index(rows: Tensor, num_envs: int) -> Tensor:
     rows = torch.as_tensor(rows)
     if rows.dtype == torch.bool:
         if rows.shape != (num_envs,):
-            raise PoiseError(f"a row mask must be ({num_envs},), got {tuple(rows.shape)}")
+            raise PoiseError(
+                f"a row mask must be ({num_envs},), got {tuple(rows.shape)}", code="wrong-shape"
+            )
         return torch.nonzero(rows)[:, 0]
     rows = rows.reshape(-1).long()
     values = rows.sort().values
     # One comparison decides, so that a GPU is waited for once.
     wrong = (values < 0).any() | (values >= num_envs).any() | (values.diff() == 0).any()
     if len(values) and bool(wrong):
-        raise PoiseError(f"rows must be distinct and in 0 to {num_envs - 1}, got {rows.tolist()[:12]}")
+        raise PoiseError(
+            f"rows must be distinct and in 0 to {num_envs - 1}, got {rows.tolist()[:12]}",
+            code="index-outside",
+        )
     return rows
 
 
@@ -102,7 +116,7 @@ class Worlds(ABC):
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, device: torch.device) -> None:
         if num_envs < 1:
-            raise PoiseError(f"num_envs must be above 0, got {num_envs}")
+            raise PoiseError(f"num_envs must be above 0, got {num_envs}", code="out-of-range")
         self._model, self._num_envs, self._device = model, num_envs, device
 
     def _show(self) -> None:
@@ -144,6 +158,7 @@ class Worlds(ABC):
             raise PoiseError(
                 "the model has no contact force sensors",
                 hint="Call poise.sim.add_contact_sensors(spec) before making the backend.",
+                code="sensors-missing",
             )
         sensed = self._state["sensordata"]
         out = sensed.new_zeros(self._num_envs, self._model.nbody, 3)
@@ -159,5 +174,6 @@ class Worlds(ABC):
                 f"the snapshot has shape {tuple(snapshot.shape)}, but this backend needs "
                 f"({n}, {full}), or ({n}, {short}) without derived fields",
                 hint="Restore into the same model, with the same state fields bound.",
+                code="snapshot-differs",
             )
         return snapshot.shape[1] == full

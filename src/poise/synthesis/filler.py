@@ -51,17 +51,32 @@ def check_keyframes(keyframes: Sequence[int], frames: int, where: str | None = N
     """
     keys = tuple(keyframes)
     if len(keys) < 2:
-        raise PoiseError(f"in-betweening needs at least 2 keyframes, got {len(keys)}", where)
+        raise PoiseError(
+            f"in-betweening needs at least 2 keyframes, got {len(keys)}", where, code="too-few-keyframes"
+        )
     for k in keys:
         if not 0 <= k < frames:
             raise PoiseError(
-                f"keyframe {k} is out of range", where, f"The clip has frames 0 to {frames - 1}"
+                f"keyframe {k} is out of range",
+                where,
+                f"The clip has frames 0 to {frames - 1}",
+                code="frame-outside",
             )
     for a, b in pairwise(keys):
         if a == b:
-            raise PoiseError(f"keyframe {a} is given twice", where, "Give every keyframe once")
+            raise PoiseError(
+                f"keyframe {a} is given twice",
+                where,
+                "Give every keyframe once",
+                code="keyframe-repeated",
+            )
         if a > b:
-            raise PoiseError(f"keyframe {b} comes after {a}", where, "Give keyframes in rising order")
+            raise PoiseError(
+                f"keyframe {b} comes after {a}",
+                where,
+                "Give keyframes in rising order",
+                code="not-rising",
+            )
     return keys
 
 

@@ -235,10 +235,14 @@ class Kinematic:
     ):
         if seeds.ndim != 3 or seeds.shape[1] != net.config.past or not len(seeds):
             raise PoiseError(
-                f"seeds must be pasts of {net.config.past} frames, got {tuple(seeds.shape)}", "Kinematic"
+                f"seeds must be pasts of {net.config.past} frames, got {tuple(seeds.shape)}",
+                "Kinematic",
+                code="wrong-shape",
             )
         if not temperature >= 0:
-            raise PoiseError(f"the temperature must be at least 0, got {temperature:g}")
+            raise PoiseError(
+                f"the temperature must be at least 0, got {temperature:g}", code="out-of-range"
+            )
         self.net, self.seeds, self.fps = net.eval(), seeds.double(), fps
         self.temperature, self.bounds, self.codes, self.wishes = temperature, bounds, codes, wishes
         self.past, self.future = net.config.past, net.config.future
@@ -315,7 +319,7 @@ class Kinematic:
         one = torch.zeros(1, dtype=torch.long)
         made = self.begin(1, rng) if past is None else past[None].double()
         if made.shape[1] != self.past:
-            raise PoiseError(f"a past has {self.past} frames, got {made.shape[1]}")
+            raise PoiseError(f"a past has {self.past} frames, got {made.shape[1]}", code="wrong-shape")
         parts, have = [made], self.past
         while have < self.past + frames:
             made = self.generate(made[:, -self.past :], one, rng)

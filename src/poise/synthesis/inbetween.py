@@ -80,7 +80,9 @@ def fill_keyframes(
     """
     filling = filling or Filling()
     if not 1 <= filling.samples <= 1000:
-        raise PoiseError(f"the number of samples must be 1 to 1000, got {filling.samples}")
+        raise PoiseError(
+            f"the number of samples must be 1 to 1000, got {filling.samples}", code="out-of-range"
+        )
     keys = check_keyframes(keyframes, clip.frames, clip.name)
     other = unlike(clip, model)
     step = clip.fps / model.fps
@@ -181,7 +183,7 @@ def _example(other: str, clip: Clip, model: InbetweenModel) -> Clip:
     if model.example is not None:
         return unpack_clips(*model.example)[0]
     hint = "Retarget the clip to the model's skeleton, or train a model on clips of this one"
-    raise PoiseError(other, clip.name, hint)
+    raise PoiseError(other, clip.name, hint, code="skeleton-differs")
 
 
 def _as_clip(clip: Clip, root: Tensor, rot: Tensor, name: str) -> Clip:
@@ -268,7 +270,9 @@ class Partial:
         for part in self.parts:
             if part not in PARTS:
                 hint = did_you_mean(part, list(PARTS))
-                raise PoiseError(f"there is no part '{part}' of a keyframe", hint=hint)
+                raise PoiseError(
+                    f"there is no part '{part}' of a keyframe", hint=hint, code="unknown-body-part"
+                )
 
     def touches(self, source: Clip) -> tuple[TouchPoint, ...]:
         """The places of its parts in `source`.
@@ -278,7 +282,7 @@ class Partial:
         """
         if not 0 <= self.frame < source.frames:
             what = f"a keyframe of parts is wanted in frame {self.frame}, and the clip has 0 to"
-            raise PoiseError(f"{what} {source.frames - 1}", source.name)
+            raise PoiseError(f"{what} {source.frames - 1}", source.name, code="frame-outside")
         pos = source.positions()[self.frame]
         limbs = dict.fromkeys(limb for part in self.parts for limb in PARTS[part])
         joints = {limb: 0 if limb == PELVIS else end_of(source.skeleton, limb) for limb in limbs}
@@ -295,13 +299,18 @@ def timed(clip: Clip, keys: Sequence[int], times: Sequence[float]) -> tuple[Clip
         PoiseError: not one time for each keyframe, or times that do not rise.
     """
     if len(times) != len(keys):
-        raise PoiseError(f"{len(keys)} keyframes need as many times, got {len(times)}", clip.name)
+        raise PoiseError(
+            f"{len(keys)} keyframes need as many times, got {len(times)}",
+            clip.name,
+            code="count-differs",
+        )
     gaps = np.diff(np.asarray(times, dtype=float))
     if not bool((gaps * clip.fps >= 0.5).all()):
         k = int(np.argmin(gaps))
         raise PoiseError(
             f"times must rise by a frame or more, got {times[k]:g} and then {times[k + 1]:g} s",
             clip.name,
+            code="not-rising",
         )
     return retimed(clip, keys, gaps * clip.fps / np.diff(np.asarray(keys)))
 
@@ -325,7 +334,7 @@ def partials_of(words: Sequence[str]) -> tuple[Partial, ...]:
         frame, _, parts = word.partition(":")
         if not frame.isdigit():
             hint = "Write 45:hands,feet,pelvis, a frame and the parts that stay"
-            raise PoiseError(f"--partial '{word}' makes no sense", hint=hint)
+            raise PoiseError(f"--partial '{word}' makes no sense", hint=hint, code="option-malformed")
         out.append(Partial(int(frame), tuple(parts.split(",")) if parts else EVERYTHING))
     return tuple(out)
 
@@ -340,4 +349,6 @@ def times_of(text: str) -> tuple[float, ...]:
         return tuple(float(word) for word in text.replace(",", " ").split())
     except ValueError:
         hint = "Write for example --times 0,1.2,2.5, in s"
-        raise PoiseError(f"--times needs numbers, got '{text}'", hint=hint) from None
+        raise PoiseError(
+            f"--times needs numbers, got '{text}'", hint=hint, code="option-malformed"
+        ) from None

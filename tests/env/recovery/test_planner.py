@@ -26,6 +26,7 @@ from poise.motion import ClipLibrary
 from poise.motion.rotations import facing, heading_angle, quat_angle, quat_between, turned, yaw_quat
 from poise.recipes.perpetual import build, standing, walking_clips
 from poise.recipes.perpetual_settings import Perpetual
+from refusals import refused
 from toy_human import swing
 from toy_library import rises, tiny
 
@@ -269,7 +270,6 @@ def test_a_quick_pace_is_up_and_back_sooner_and_is_kept(built: Built) -> None:
 
 
 def test_settings_refuse_what_makes_no_sense() -> None:
-    from poise.errors import PoiseError
 
-    with pytest.raises(PoiseError, match="demonstration_share"):
+    with refused("out-of-range", says="demonstration_share"):
         replace(Perpetual().recovering, demonstration_share=1.0)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from poise.body.topology import subtree
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.kinematics import RetargetConfig, retarget
 from poise.kinematics.feet import rest_height
@@ -27,6 +26,7 @@ from poise.motion.rotations import (
     quat_mul,
     quat_rotate,
 )
+from refusals import refused
 from toy_human import human, swing
 
 CLIPS = {
@@ -148,7 +148,7 @@ def test_a_folded_skeleton_needs_a_clip_unless_the_names_agree() -> None:
     clip = walk()
     folded = turned(clip).skeleton
     names = {"LeftArm": "LeftUpperArm", "RightArm": "RightUpperArm"}
-    with pytest.raises(PoiseError, match="a motion must show how it stands"):
+    with refused("rest-pose-unknown"):
         retarget(clip, renamed(folded, names))
     # Another subject of the same rig: the source shows how it stands.
     bigger = Skeleton(folded.names, folded.parents, folded.offsets * 1.1)
@@ -272,20 +272,20 @@ def test_nothing_sinks_deeper_than_in_the_source() -> None:
 def test_pairs_by_hand_overrule_guesses_and_wrong_ones_are_refused() -> None:
     clip = walk()
     strange = renamed(human(), {"LeftUpLeg": "Peter", "LeftLeg": "Paul", "LeftFoot": "Mary"})
-    with pytest.raises(PoiseError, match="left_thigh, left_shin, left_foot"):
+    with refused("role-missing", says="left_thigh, left_shin, left_foot"):
         retarget(clip, strange)
     stated = {"LeftUpLeg": "Peter", "LeftLeg": "Paul", "LeftFoot": "Mary"}
     _, report = retarget(clip, strange, stated)
     assert report.direction_max_deg < 1e-6
     by_role = {"left_thigh": "Peter", "left_shin": "Paul", "left_foot": "Mary"}
     assert retarget(clip, strange, by_role)[1].direction_max_deg < 1e-6
-    with pytest.raises(PoiseError, match=r"target has no joint 'Petr'. Did you mean 'Peter'"):
+    with refused("unknown-joint", says=("target", "Petr", "Peter")):
         retarget(clip, strange, stated | {"LeftUpLeg": "Petr"})
-    with pytest.raises(PoiseError, match="source has no joint 'LeftUpLg'"):
+    with refused("unknown-joint", says=("source", "LeftUpLg")):
         retarget(clip, strange, {"LeftUpLg": "Peter"})
-    with pytest.raises(PoiseError, match="turns the hierarchy round"):
+    with refused("hierarchy-reversed"):
         retarget(clip, human(2.0), {"LeftUpLeg": "LeftLeg", "LeftLeg": "LeftUpLeg"})
-    with pytest.raises(PoiseError, match="both 'LeftUpLeg' and 'LeftLeg' were mapped to 'Peter'"):
+    with refused("joint-mapped-twice", says=("LeftUpLeg", "LeftLeg", "Peter")):
         retarget(clip, strange, {"LeftUpLeg": "Peter", "LeftLeg": "Peter"})
 
 
@@ -301,19 +301,19 @@ def test_skeletons_that_no_human_has_are_refused_in_a_sentence() -> None:
     legless = Skeleton(
         ("Hips", "Spine", "Head"), (-1, 0, 1), np.array([[0, 0, 0], [0, 0, 0.3], [0, 0, 0.3]])
     )
-    with pytest.raises(PoiseError, match="no joint was found for left_thigh"):
+    with refused("role-missing", says="left_thigh"):
         retarget(clip, legless)
-    with pytest.raises(PoiseError, match="left leg has a bone of no length"):
+    with refused("zero-length-bone", says="left"):
         retarget(clip, changed("LeftLeg", (0, 0, 0)))
     narrow = np.array(base.offsets)
     for side in ("Left", "Right"):
         narrow[base.index(f"{side}UpLeg")] = 0.0
-    with pytest.raises(PoiseError, match="hang on one point"):
+    with refused("facing-unknown"):
         retarget(clip, Skeleton(base.names, base.parents, narrow))
     swapped = {"LeftToe": "RightToe", "RightToe": "LeftToe"}
     for part in ("UpLeg", "Leg", "Foot"):
         swapped |= {f"Left{part}": f"Right{part}", f"Right{part}": f"Left{part}"}
-    with pytest.raises(PoiseError, match="left and right seem to be swapped"):
+    with refused("sides-swapped"):
         retarget(clip, renamed(base, swapped))
     # A forearm of no length points nowhere, and the rest works.
     made, report = retarget(clip, changed("LeftHand", (0, 0, 0)))
@@ -357,7 +357,7 @@ def test_deepmimics_hinges_stay_hinges(data_dir) -> None:
 
 
 def test_the_example_must_be_on_the_same_skeleton() -> None:
-    with pytest.raises(PoiseError, match="another skeleton"):
+    with refused("skeleton-differs"):
         retarget(walk(), human(2.0), example=walk(1.5))
 
 

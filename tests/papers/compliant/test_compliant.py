@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from poise.control import Compliance, Stiffness
-from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.figures import AXES, Measured, measure, slope, throws
 from poise.papers.compliant.motions import standing
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -60,5 +60,5 @@ def test_a_slope_by_hand() -> None:
 
 
 def test_a_policy_that_knows_no_ease(tracker: Tracker) -> None:
-    with pytest.raises(PoiseError, match="the policy knows no pose at ease"):
+    with refused("no-pose-at-ease"):
         standing(replace(tracker, recovery_clips=None), 1.0)

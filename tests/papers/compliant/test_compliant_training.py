@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from poise.cli.main import main
-from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
@@ -28,6 +27,7 @@ from poise.papers.compliant.training import (
     shipped,
     train,
 )
+from refusals import refused
 
 PPO = PPOConfig(
     horizon=4, epochs=1, minibatch=16, std=0.1, policy_hidden=(8,), value_hidden=(8,), norm_warmup=1
@@ -87,11 +87,11 @@ def test_a_tiny_training_goes_on_and_is_played(tracker: Tracker, tmp_path: Path)
     tensors, meta = load_checkpoint(one)
     for odd in ({}, {"recipe": "compliant"}, {"recipe": "compliant", "config": 3}):
         save_checkpoint(one, tensors, {**meta, "metadata": odd})
-        with pytest.raises(PoiseError, match="nothing of the recipe compliant"):
+        with refused("not-a-run"):
             open_learned(one, tracker)
-    with pytest.raises(PoiseError, match="a run with other settings"):
+    with refused("settings-differ"):
         train(replace(TINY, seed=1), tracker, tmp_path / "a", Until(iterations=3), threads=1)
-    with pytest.raises(PoiseError, match="holds no run of the recipe compliant"):
+    with refused("not-a-run"):
         open_learned(tmp_path, tracker)
 
 
@@ -127,7 +127,7 @@ def test_steps_become_smaller_in_the_end(tracker: Tracker, tmp_path: Path) -> No
         lambda stats: lr.append(stats.update.policy_lr), 1, False,
     )  # fmt: skip
     assert lr == pytest.approx([PPO.policy_lr] * 3 + [PPO.policy_lr / 2])
-    with pytest.raises(PoiseError, match="cooling must lie in 0 to 1"):
+    with refused("out-of-range", says="cooling"):
         replace(TINY, cooling=1.5)
 
 
@@ -140,5 +140,5 @@ def test_scenes_that_are_not_learned(
 ) -> None:
     assert main(["train", "compliant", scene, "-o", str(tmp_path / "run")]) == 2
     assert what in capsys.readouterr().err and not (tmp_path / "run").exists()
-    with pytest.raises(PoiseError, match="reach must lie in 0 to pi"):
+    with refused("out-of-range", says="reach"):
         Compliant(scene="door")

@@ -15,7 +15,6 @@ from poise.control import Compliance, Stiffness
 from poise.env.events import InScene, ScenePart
 from poise.env.pushes import Push
 from poise.env.yielding import DisplacedGoal
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
@@ -36,6 +35,7 @@ from poise.papers.compliant.scenes import body_scenes as trampoline
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Scene, SceneSim
 from poise.sim.props import Door
+from refusals import refused
 from toy_policy import WALK
 
 
@@ -136,7 +136,7 @@ def test_a_hand_that_keeps_away_from_the_knob_ends_the_episode(task: Imitation) 
 def test_a_door_that_nobody_gets_through(task: Imitation) -> None:
     broad = door.breadth(task.humanoid, task.reference)
     assert 0.25 < broad < 0.6
-    with pytest.raises(PoiseError, match=r"is 0\.2 m wide and the body 0\.\d\d m: it cannot pass"):
+    with refused("too-narrow", says="0.2"):
         Doorway(0.2).stage(task.humanoid, task.reference)
 
 
@@ -251,7 +251,7 @@ def test_a_skeleton_without_hands(task: Imitation, scene: PlayScene) -> None:
     table = task.humanoid.table
     rows = tuple(replace(r, kind="forearm" if r.kind == "hand" else r.kind) for r in table.rows)
     body = make_humanoid(task.humanoid.skeleton, replace(table, rows=rows))
-    with pytest.raises(PoiseError, match=r"the skeleton has no left hand, which '.*' needs"):
+    with refused("body-part-missing", says="left"):
         scene.stage(body, task.reference)
 
 
@@ -259,26 +259,26 @@ def test_a_skeleton_without_a_head(task: Imitation) -> None:
     table = task.humanoid.table
     rows = tuple(replace(r, kind="neck" if r.kind == "head" else r.kind) for r in table.rows)
     body = make_humanoid(task.humanoid.skeleton, replace(table, rows=rows))
-    with pytest.raises(PoiseError, match="the skeleton has no head, which 'ball' needs"):
+    with refused("body-part-missing"):
         Balance().stage(body, task.reference)
 
 
 @pytest.mark.parametrize(
     ("made", "what"),
     [
-        (lambda: Pull(0.0), "a pull needs a force above 0 N"),
-        (lambda: Pull(direction=(0.0, 0.0, 0.0)), "and a direction"),
-        (lambda: Pull(lasts_s=0.0), "lasts some time"),
-        (lambda: Hands(sway=2.0), "its sway below 1 m"),
-        (lambda: Doorway(0.0), "a door is 0 to 10 m wide"),
-        (lambda: Doorway(made_for=9.0), "a motion is made for 0.5 to 3 m"),
-        (lambda: Throws(mass=0.0), "must weigh above 0"),
-        (lambda: Trampoline(2.0), "a bounce is 0 to 1 m high"),
-        (lambda: Trampoline(first=3.0), "begins within 3 s"),
-        (lambda: Balance(length=0.0), "a rod is 0.1 to 5 m long"),
-        (lambda: Balance(pushes=-1.0), "a push has at least 0 N"),
+        (lambda: Pull(0.0), "pull"),
+        (lambda: Pull(direction=(0.0, 0.0, 0.0)), "pull"),
+        (lambda: Pull(lasts_s=0.0), "pull"),
+        (lambda: Hands(sway=2.0), "hands"),
+        (lambda: Doorway(0.0), "door"),
+        (lambda: Doorway(made_for=9.0), "door"),
+        (lambda: Throws(mass=0.0), "throws"),
+        (lambda: Trampoline(2.0), "trampoline"),
+        (lambda: Trampoline(first=3.0), "trampoline"),
+        (lambda: Balance(length=0.0), "ball"),
+        (lambda: Balance(pushes=-1.0), "ball"),
     ],
 )
 def test_scenes_that_are_none(made: object, what: str) -> None:
-    with pytest.raises(PoiseError, match=what):
+    with refused("out-of-range", says=what):
         made()  # type: ignore[operator]

@@ -9,11 +9,11 @@ import torch
 from poise.control import LinearHelp
 from poise.env import observations as obs
 from poise.env import rewards as reward
-from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.papers.skeleton2humanoid.recipe import FALLS, INITIAL, LEFT, Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
+from refusals import refused
 from toy_human import swing
 
 
@@ -48,7 +48,7 @@ def test_the_baseline_differs_in_one_frame_and_the_curriculum_alone() -> None:
     assert settings("one frame", budget).help_limit == LEFT
     assert settings("no curriculum", budget).observation == "next two"
     assert settings("full to zero", budget).help_limit == 0.0
-    with pytest.raises(PoiseError, match="no variant"):
+    with refused("unknown-choice", says="variant"):
         settings("half")  # type: ignore[arg-type]
 
 

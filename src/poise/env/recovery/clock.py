@@ -54,18 +54,29 @@ class Recovery:
     def __post_init__(self) -> None:
         for name in ("fallen", "far", "continues"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "Recovery")
+                raise PoiseError(
+                    f"{name} must lie in [0, 1], got {getattr(self, name)}",
+                    "Recovery",
+                    code="out-of-range",
+                )
         if self.grace < 0 or self.settle < 0:
             raise PoiseError(
-                f"grace and settle must not be below 0, got {self.grace} and {self.settle}", "Recovery"
+                f"grace and settle must not be below 0, got {self.grace} and {self.settle}",
+                "Recovery",
+                code="out-of-range",
             )
         low, high = self.distance
         if not 0 <= low <= high < math.inf:
-            raise PoiseError(f"distance must rise from 0 or more, got {low:g} to {high:g}", "Recovery")
+            raise PoiseError(
+                f"distance must rise from 0 or more, got {low:g} to {high:g}",
+                "Recovery",
+                code="not-rising",
+            )
         if not 0 < self.switch < self.reach and self.switch < math.inf:
             raise PoiseError(
                 f"switch must lie above 0 and below reach, got {self.switch:g} and {self.reach:g} m",
                 "Recovery",
+                code="not-rising",
             )
 
     @classmethod

@@ -49,7 +49,9 @@ class Drop:
         validate(self)
         for name in ("size", "steps", "count"):
             if not getattr(self, name) > 0:
-                raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "Drop")
+                raise PoiseError(
+                    f"{name} must be above 0, got {getattr(self, name)}", "Drop", code="out-of-range"
+                )
 
 
 def fall_states(
@@ -79,6 +81,7 @@ def fall_states(
             f"of {ROUNDS} drops each, {drop.count - len(kept)} of {drop.count} characters did not come "
             "to lie on the floor",
             hint="Drop them for more steps, or drive them less",
+            code="fall-unsettled",
         )
     kept[:, :2] = 0.0
     return kept

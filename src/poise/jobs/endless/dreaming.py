@@ -69,13 +69,18 @@ def dream(
     """
     config = changed(config or Dream(), settings)
     if not 0.1 <= seconds <= 36_000:
-        raise PoiseError(f"a motion lasts from 0.1 s to 10 hours, got {seconds:g} s")
+        raise PoiseError(
+            f"a motion lasts from 0.1 s to 10 hours, got {seconds:g} s", code="out-of-range"
+        )
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
     model = generator if isinstance(generator, GeneratorModel) else load_generator(generator)
     made = model.generator(tracker.humanoid, config.temperature, config.style)
     rate = tracker.config.sim.control_hz
     if model.fps != rate:
-        raise PoiseError(f"the generator makes {model.fps:g} frames a second, the policy does {rate:g}")
+        raise PoiseError(
+            f"the generator makes {model.fps:g} frames a second, the policy does {rate:g}",
+            code="rate-differs",
+        )
     steps = max(1, round(seconds * rate))
     notes: list[str] = []
     if config.recover and tracker.recovery_clips is None:
@@ -140,7 +145,7 @@ def past_of(clip: Clip | str | Path, generator: Kinematic, tracker: Tracker) -> 
         raise PoiseError(
             f"the generator sees {generator.past} frames at {generator.fps:g} Hz, "
             f"{generator.past / generator.fps:.1f} s, and the seed clip has {len(qpos)}",
-            clip.name, "Give a longer one",
+            clip.name, "Give a longer one", code="clip-too-short",
         )  # fmt: skip
     return qpos[-generator.past :]
 

@@ -77,11 +77,17 @@ class Dream:
     def __post_init__(self) -> None:
         validate(self)
         if not 1 <= self.count <= MOST:
-            raise PoiseError(f"there may be 1 to {MOST} characters, got {self.count}")
+            raise PoiseError(
+                f"there may be 1 to {MOST} characters, got {self.count}", code="out-of-range"
+            )
         if not 0 <= self.temperature <= 10:
-            raise PoiseError(f"the temperature must lie in 0 to 10, got {self.temperature:g}")
+            raise PoiseError(
+                f"the temperature must lie in 0 to 10, got {self.temperature:g}", code="out-of-range"
+            )
         if not 0 <= self.label_seconds <= 3600:
-            raise PoiseError(f"a label is kept to for 0 to 3600 s, got {self.label_seconds:g}")
+            raise PoiseError(
+                f"a label is kept to for 0 to 3600 s, got {self.label_seconds:g}", code="out-of-range"
+            )
         Steering(self.targets)
 
 
@@ -445,7 +451,7 @@ class MotionWriter:
         if need > free:
             raise PoiseError(
                 f"the motion takes about {need / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free", path,
-                "Make a shorter one, or choose another disk",
+                "Make a shorter one, or choose another disk", code="disk-full",
             )  # fmt: skip
         self._beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
         self._pieces = list[Clip]()

@@ -78,6 +78,7 @@ class GeneratorModel:
             raise PoiseError(
                 "the generator is of another body",
                 hint="Give the policy that it was trained with, or train a generator for this one",
+                code="bodies-differ",
             )
         seeds, codes = self.seeds, self.codes
         if style is not None:
@@ -89,7 +90,9 @@ class GeneratorModel:
         has = [k for k in self.labels if self.codes is not None and self._count(k)]
         if style not in has or self.codes is None or self.kinds is None:
             known = f"it has {', '.join(has)}" if has else "its library has no labels"
-            raise PoiseError(f"the generator knows no style '{style[:40]}'; {known}", "style")
+            raise PoiseError(
+                f"the generator knows no style '{style[:40]}'; {known}", "style", code="unknown-style"
+            )
         kind = self.labels.index(style)
         return self.seeds[self.kinds == kind], self.codes.only(kind)
 
@@ -128,7 +131,7 @@ def load_generator(path: str | Path | None = None) -> GeneratorModel:
     file = file / GENERATOR if file.is_dir() else file
     tensors, meta = load_checkpoint(file, _Meta)
     if meta["kind"] != "kinematic policy":
-        raise PoiseError("the file holds no kinematic policy", file)
+        raise PoiseError("the file holds no kinematic policy", file, code="wrong-file-kind")
     config = from_data(CVAEConfig, meta["config"], file)
     hinges = tuple(meta["hinges"])
     tensors = {k: v.float() for k, v in tensors.items()}
@@ -136,7 +139,7 @@ def load_generator(path: str | Path | None = None) -> GeneratorModel:
     for name, shape in wanted.items():
         value = tensors.get(name, torch.empty(0))
         if value.ndim != len(shape) + 1 or value.shape[1:] != shape or not bool(value.isfinite().all()):
-            raise PoiseError(f"the file's '{name}' is missing or damaged", file)
+            raise PoiseError(f"the file's '{name}' is missing or damaged", file, code="file-damaged")
     net = make_cvae(ROOT + len(hinges), config, torch.Generator().manual_seed(0))
     if not any(k.startswith(ENCODER) for k in tensors):
         # It was left out.
@@ -155,7 +158,7 @@ def load_generator(path: str | Path | None = None) -> GeneratorModel:
             or codes.kinds is None
             or len(codes.kinds) != len(codes.keys)
         ):
-            raise PoiseError("the file's labels are damaged", file)
+            raise PoiseError("the file's labels are damaged", file, code="file-damaged")
     return GeneratorModel(
         net.eval(), tensors["seeds"].double(), tensors["bounds"].double(), hinges, float(meta["fps"]),
         meta["about"], codes, tuple(meta.get("labels", ())), kinds,
@@ -186,7 +189,9 @@ def read_labels(path: Path) -> tuple[Label, ...]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
-        raise PoiseError("the labels could not be read", path, "Give a text file") from None
+        raise PoiseError(
+            "the labels could not be read", path, "Give a text file", code="file-unreadable"
+        ) from None
     out = list[Label]()
     for number, line in enumerate(lines, 1):
         words = line.split("#")[0].split(None, 1)
@@ -195,12 +200,16 @@ def read_labels(path: Path) -> tuple[Label, ...]:
         try:
             name, pattern = words[0], re.compile(words[1].strip())
         except IndexError:
-            raise PoiseError(f"line {number} has a label alone", path, "Write LABEL REGEX") from None
+            raise PoiseError(
+                f"line {number} has a label alone", path, "Write LABEL REGEX", code="line-malformed"
+            ) from None
         except re.error as problem:
-            raise PoiseError(f"line {number} has no regular expression ({problem})", path) from None
+            raise PoiseError(
+                f"line {number} has no regular expression ({problem})", path, code="bad-regex"
+            ) from None
         out.append(Label(name, pattern))
     if len(out) > MOST:
-        raise PoiseError(f"there may be {MOST} labels at most, got {len(out)}", path)
+        raise PoiseError(f"there may be {MOST} labels at most, got {len(out)}", path, code="over-limit")
     return tuple(out)
 
 

@@ -72,7 +72,9 @@ class Endless:
     def __post_init__(self) -> None:
         validate(self)
         if not 0 <= self.balance <= 1:
-            raise PoiseError(f"balance must lie in 0 to 1, got {self.balance:g}", "Endless")
+            raise PoiseError(
+                f"balance must lie in 0 to 1, got {self.balance:g}", "Endless", code="out-of-range"
+            )
 
     @classmethod
     def paper(cls) -> Endless:
@@ -98,6 +100,7 @@ def motions_of(
             f"the library has {usable} windows of {window} frames in a row at {rate:g} Hz, and at least "
             f"{LEAST_WINDOWS} are needed; its longest clip has {longest} frames",
             hint=f"Give more clips that last longer than {window / rate:.1f} s",
+            code="library-too-small",
         )
     tell(f"{len(qpos)} clips, {usable:,} windows of {window} frames")
     parts = [features_of(q, rate).float() for q in qpos]
@@ -274,7 +277,9 @@ def begin(
         wanted = to_data(config) | ({"steps": held.steps} if minutes is not None else {})
         if of != said or to_data(held) != wanted:
             what = "the folder holds a run of another library or with other settings"
-            raise PoiseError(what, folder, "Resume it as it is or choose another folder")
+            raise PoiseError(
+                what, folder, "Resume it as it is or choose another folder", code="run-differs"
+            )
         return motions, held
     motions = read_motions(
         library, tracker, config.net, hold_out, tell, leave_out=leave_out, config=reading
@@ -301,7 +306,7 @@ def opened(run: Path) -> tuple[Motions, Endless, list[str]]:
     """
     tensors, meta = load_checkpoint(run, _Meta)
     if meta["kind"] != "endless run":
-        raise PoiseError("the file is no training of a kinematic policy", run)
+        raise PoiseError("the file is no training of a kinematic policy", run, code="wrong-file-kind")
     frames, first, seeds, bounds, reach = (
         take(tensors, k) for k in ("frames", "first", "seeds", "bounds", "reach")
     )

@@ -84,7 +84,7 @@ def inbetween(
         PoiseError: keyframes that make no sense, or a skeleton that cannot be brought onto the model's.
     """
     if not 0 <= adapt <= 1000:
-        raise PoiseError(f"adapt must be 0 to 1000 iterations, got {adapt}")
+        raise PoiseError(f"adapt must be 0 to 1000 iterations, got {adapt}", code="out-of-range")
     source = clip_of(clip)
     keys = check_keyframes(keyframes, source.frames, source.name)
     net = model if isinstance(model, InbetweenModel) else load_model(shipped_model(model))
@@ -107,5 +107,6 @@ def shipped_model(path: str | Path | None = None) -> Path:
         raise PoiseError(
             "no in-betweening network came with this installation",
             hint="Train one with poise train inbetween --library DIR -o RUN, and give --model RUN",
+            code="model-missing",
         )
     return shipped

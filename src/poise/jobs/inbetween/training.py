@@ -109,7 +109,12 @@ def motion_files(library: Path) -> list[Path]:
     files = sorted(f for f in library.rglob("*") if f.suffix.lower() in suffixes and f.is_file())
     if not files:
         what = "there is no motion file in it" if library.is_dir() else "there is no such folder"
-        raise PoiseError(what, library, "Give a folder with BVH or AMC files")
+        raise PoiseError(
+            what,
+            library,
+            "Give a folder with BVH or AMC files",
+            code="no-motion-files" if library.is_dir() else "file-missing",
+        )
     return files
 
 
@@ -124,7 +129,9 @@ def read_all(files: list[Path], tell: Callable[[str], None]) -> tuple[list[Clip]
         if k % 200 == 0:
             tell(f"{k} of {len(files)} files read")
     if not clips:
-        raise PoiseError(f"none of the {len(files)} files could be read", hint=notes[0])
+        raise PoiseError(
+            f"none of the {len(files)} files could be read", hint=notes[0], code="no-usable-files"
+        )
     return clips, tuple(notes)
 
 
@@ -341,7 +348,9 @@ def begin(
         _, meta = load_checkpoint(run)
         if from_data(Inbetween, meta.get("config", {}), run) != from_data(Inbetween, said):
             hint = "Resume it as it is or choose another folder"
-            raise PoiseError("the folder holds a run with other settings", folder, hint)
+            raise PoiseError(
+                "the folder holds a run with other settings", folder, hint, code="settings-differ"
+            )
         steps = int(meta["steps"])
     how = (config.onto, config.reading)
     bank, notes = library_bank(library, folder / FRAMES, config.fps, tell, *how)
@@ -413,7 +422,7 @@ def validation(task: Task, lengths: tuple[int, ...] = (5, 15, 30)) -> Callable[.
     """Figures of a network on the validation windows."""
     held = task.validation
     if held is None:
-        raise PoiseError("no clip is held out for validation")
+        raise PoiseError("no clip is held out for validation", code="none-held-out")
 
     def check(net: Any) -> dict[str, float]:
         rows = evaluate(net, held, lengths)

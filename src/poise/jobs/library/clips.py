@@ -185,7 +185,9 @@ class LibraryConfig:
         taken = (*self.keep, *self.leave_out, *self.backwards)
         check_patterns((*taken, *(p for p, _ in (*self.skeletons, *self.rates))))
         if self.min_frames < 3:
-            raise PoiseError(f"min_frames must be at least 3, got {self.min_frames}")
+            raise PoiseError(
+                f"min_frames must be at least 3, got {self.min_frames}", code="out-of-range"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +245,9 @@ def read_all(
             tell(f"{k} of {len(files)} files read")
     if not read:
         first = next(iter(notes.values()))
-        raise PoiseError(f"none of the {len(files)} files can be used", None, first.sentence())
+        raise PoiseError(
+            f"none of the {len(files)} files can be used", None, first.sentence(), code="no-usable-files"
+        )
     return read, notes
 
 

@@ -55,7 +55,12 @@ def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFi
     found: dict[Path, tuple[str, ...]] = {}
     for source in map(Path, given):
         if not source.exists():
-            raise PoiseError("there is no such file or folder", source, "Give a folder of motion files")
+            raise PoiseError(
+                "there is no such file or folder",
+                source,
+                "Give a folder of motion files",
+                code="file-missing",
+            )
         root = source.absolute()
         files = [root] if root.is_file() else sorted(f for f in root.rglob("*") if is_motion(f))
         base = root.parents[min(2, len(root.parents) - 1)] if root.is_file() else root.parent
@@ -80,7 +85,7 @@ def refuse_without_motion(given: Sequence[Path | str]) -> NoReturn:
             refuse_flat_folder(folder)
     where = ", ".join(map(str, given)) or None
     hint = "Give a folder with motion files (BVH, AMC, GLB, C3D, TRC, npz and more: docs/formats.md)"
-    raise PoiseError("holds no motion file", where, hint)
+    raise PoiseError("holds no motion file", where, hint, code="no-motion-files")
 
 
 def is_motion(path: Path) -> bool:
@@ -126,7 +131,9 @@ def check_patterns(patterns: Sequence[str]) -> None:
         try:
             re.compile(pattern)
         except re.error as problem:
-            raise PoiseError(f"'{pattern}' is no regular expression: {problem}") from None
+            raise PoiseError(
+                f"'{pattern}' is no regular expression: {problem}", code="bad-regex"
+            ) from None
 
 
 def content_key(files: Sequence[MotionFile], settings: Any) -> str:

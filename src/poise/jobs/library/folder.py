@@ -99,7 +99,9 @@ def library_of(
     target = target_of(onto, [taken.clip for taken in read], body)
     if config.own_bones and (target.example is None or body.mjcf is not None):
         what = "clips keep their bones on a body that is generated, from a clip that shows how it stands"
-        raise PoiseError(what, hint="Leave own_bones out, or give a clip to come onto")
+        raise PoiseError(
+            what, hint="Leave own_bones out, or give a clip to come onto", code="settings-conflict"
+        )
     examples: dict[tuple, Clip] = {}
     own: dict[tuple, Target] = {}
     clips: list[Clip] = []
@@ -117,7 +119,7 @@ def library_of(
     report = LibraryReport(tuple(notes[f.name] for f in files), target.words, fps)
     if not clips:
         what = f"none of the {len(files)} clips can be used"
-        raise PoiseError(what, hint=report.clips[-1].sentence())
+        raise PoiseError(what, hint=report.clips[-1].sentence(), code="no-usable-files")
     if store is not None:
         tensors, packed = pack_clips(clips)
         save_checkpoint(store, tensors, {"clips": packed, "report": report.to_dict()})
@@ -140,10 +142,18 @@ def split(library: ClipLibrary, hold_out: Sequence[str]) -> Split:
         if not any(matches((pattern,), n, s) for n, s in subjects.items()):
             known = sorted(set(subjects.values()))
             hint = f"Subjects: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
-            raise PoiseError(f"'{pattern}' fits no clip and no subject of the library", None, hint)
+            raise PoiseError(
+                f"'{pattern}' fits no clip and no subject of the library",
+                None,
+                hint,
+                code="pattern-fits-nothing",
+            )
     held = [matches(hold_out, n, s) for n, s in subjects.items()]
     if all(held) or not any(held):
-        raise PoiseError(f"{sum(held)} of {len(held)} clips are held out; both sides need some")
+        raise PoiseError(
+            f"{sum(held)} of {len(held)} clips are held out; both sides need some",
+            code="split-one-sided",
+        )
     return Split(
         *(
             ClipLibrary(

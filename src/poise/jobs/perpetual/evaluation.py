@@ -169,7 +169,7 @@ def check_falls(imitation: Imitation, count: int = 32) -> None:
         fall_states(backend, imitation.humanoid, imitation.task.pd, drop, int(imitation.config.seed))
     except PoiseError as problem:
         hint = "Train without recovery: --no-recovery"
-        raise PoiseError(problem.what, "recovery", hint) from None
+        raise PoiseError(problem.what, "recovery", hint, code=problem.code) from None
     finally:
         backend.close()
 

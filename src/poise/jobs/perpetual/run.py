@@ -121,6 +121,7 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
         raise PoiseError(
             "the policy is made of primitives and a composer, which are frozen and cannot go on",
             hint="Go on from a single network, or resume its run",
+            code="policy-of-primitives",
         )
     done = {"expert": False, "trajopt": None, "help_start": 0.0}
     asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery", "noise")}
@@ -190,6 +191,7 @@ def begin(
         raise PoiseError(
             f"a library needs at least 2 clips, and there is only '{library.names[0]}'",
             hint="Use poise imitate for a single clip",
+            code="library-too-small",
         )
     held = (folder / RUN_FILE).exists()
     if held:
@@ -201,6 +203,7 @@ def begin(
             raise PoiseError(
                 "the clips are on another skeleton than the policy's body",
                 hint="Bring them onto it: library_of(folder, tracker.target)",
+                code="skeleton-differs",
             )
     # What a policy knows of coming back it keeps, whatever its new library holds of that.
     imitation = build(library, config, table, earlier.recovery_clips if earlier else None)
@@ -257,7 +260,9 @@ def knows_recovery(folder: Path) -> bool:
             return bool(said["recovers"])
         return Stage(**said["course"]["stage"]).recovers is not None
     except (KeyError, TypeError, ValueError):
-        raise PoiseError("it does not say what its stage learns", path, "The file is damaged") from None
+        raise PoiseError(
+            "it does not say what its stage learns", path, "The file is damaged", code="file-damaged"
+        ) from None
 
 
 @alone

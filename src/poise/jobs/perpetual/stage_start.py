@@ -148,7 +148,10 @@ def find_paths(
         state, meta = load_checkpoint(path)
         if meta.get("clips") != names or state["qpos"].shape != search.qpos.shape:
             raise PoiseError(
-                "it holds trajectories of other clips", path, "Remove it, or choose another folder"
+                "it holds trajectories of other clips",
+                path,
+                "Remove it, or choose another folder",
+                code="clips-differ",
             )
         search.load_state(state)
     while not search.done:
@@ -413,9 +416,15 @@ class PolicyTeacher:
 
     def __init__(self, env: ImitationEnv, tracker: Tracker):
         if len(env.goal.bodies) > 1:
-            raise PoiseError("a policy teaches on its own body, and there are several shapes")
+            raise PoiseError(
+                "a policy teaches on its own body, and there are several shapes", code="single-body-only"
+            )
         if env.goal.humanoid.identity != tracker.humanoid.identity:
-            raise PoiseError("the policy that teaches has another body", hint="Bring the clips onto its")
+            raise PoiseError(
+                "the policy that teaches has another body",
+                hint="Bring the clips onto its",
+                code="bodies-differ",
+            )
         task = stage_task(replace(tracker.config, help_start=0.0), env.goal.humanoid, None)
         # The same worlds, seen as the policy sees them.
         task = replace(task, rewards=(), dones=(), style=(), adaptive=0.0)

@@ -215,7 +215,9 @@ def look_ahead(
         PoiseError: the policy has no critic.
     """
     if tracker.value is None:
-        raise PoiseError("the policy was saved without its critic, which lookahead needs")
+        raise PoiseError(
+            "the policy was saved without its critic, which lookahead needs", code="critic-missing"
+        )
     # Copies that lose the motion may go bad; they are left behind.
     copies = (
         unforeseen(imitation)

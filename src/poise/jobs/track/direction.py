@@ -44,7 +44,11 @@ class Weight:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.factor <= MOST:
-            raise PoiseError(f"a weight must lie in 0 to {MOST:g}, got {self.factor:g}", self.part)
+            raise PoiseError(
+                f"a weight must lie in 0 to {MOST:g}, got {self.factor:g}",
+                self.part,
+                code="out-of-range",
+            )
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class Direction:
             rows_of(table, weight.part)
             if weight.first is not None and weight.first >= clip.frames:
                 what = f"{weight.part} counts from frame {weight.first} on, and the clip has 0 to"
-                raise PoiseError(f"{what} {clip.frames - 1}", clip.name)
+                raise PoiseError(f"{what} {clip.frames - 1}", clip.name, code="frame-outside")
 
     def applied(self, clip: Clip) -> tuple[Clip, tuple[str, ...]]:
         """The clip with its pins and touches, and sentences on them."""
@@ -142,6 +146,7 @@ def rows_of(table: BodyTable, part: str) -> tuple[int, ...]:
         raise PoiseError(
             f"there is no part '{part}'",
             hint=did_you_mean(part, [*known, *(r.name for r in table.rows)]),
+            code="unknown-body-part",
         )
     return found
 
@@ -169,7 +174,9 @@ def _weight(word: str) -> Weight:
         return Weight(part, float(factor), first, last)
     except ValueError:
         raise PoiseError(
-            f"--weight '{word}' makes no sense", hint="Write hands=3 or head=2:10-40"
+            f"--weight '{word}' makes no sense",
+            hint="Write hands=3 or head=2:10-40",
+            code="option-malformed",
         ) from None
 
 
@@ -178,7 +185,9 @@ def _pin(word: str) -> Pin:
         limb, span = word.split(":")
         return Pin(_limb(limb), *_span(span))
     except ValueError:
-        raise PoiseError(f"--pin '{word}' makes no sense", hint="Write left_foot:12-40") from None
+        raise PoiseError(
+            f"--pin '{word}' makes no sense", hint="Write left_foot:12-40", code="option-malformed"
+        ) from None
 
 
 def _touch(word: str) -> TouchPoint:
@@ -188,17 +197,21 @@ def _touch(word: str) -> TouchPoint:
         return TouchPoint(limb if limb == PELVIS else _limb(limb), int(frame), (x, y, z))
     except ValueError:
         hint = "Write right_hand:50:0.3,0.2,1.1, a limb, a frame and a place in m"
-        raise PoiseError(f"--touch '{word}' makes no sense", hint=hint) from None
+        raise PoiseError(
+            f"--touch '{word}' makes no sense", hint=hint, code="option-malformed"
+        ) from None
 
 
 def _limb(name: str) -> str:
     if name not in LIMBS:
-        raise PoiseError(f"there is no limb '{name}'", hint=did_you_mean(name, list(LIMBS)))
+        raise PoiseError(
+            f"there is no limb '{name}'", hint=did_you_mean(name, list(LIMBS)), code="unknown-limb"
+        )
     return name
 
 
 def _span(text: str) -> tuple[int, int]:
     first, last = (int(v) for v in text.split("-"))
     if not 0 <= first <= last:
-        raise PoiseError(f"frames must rise from 0, got {text}")
+        raise PoiseError(f"frames must rise from 0, got {text}", code="not-rising")
     return first, last

@@ -64,7 +64,11 @@ def noise_of(texts: Sequence[str]) -> tuple[Noise, ...]:
         kind, colon, strength = (x.strip() for x in text.partition(":"))
         if kind not in KINDS:
             near = did_you_mean(kind, list(KINDS))
-            raise PoiseError(f"there is no noise '{kind}'", hint=near or f"Known: {', '.join(KINDS)}")
+            raise PoiseError(
+                f"there is no noise '{kind}'",
+                hint=near or f"Known: {', '.join(KINDS)}",
+                code="unknown-choice",
+            )
         try:
             factor = float(strength) if colon else 1.0
         except ValueError:
@@ -73,6 +77,7 @@ def noise_of(texts: Sequence[str]) -> tuple[Noise, ...]:
             raise PoiseError(
                 f"the strength of noise must be a number of at least 0, got '{text}'",
                 hint=f"Write --noise {kind}:0.5",
+                code="out-of-range",
             )
         out += scaled(KINDS[kind], factor)
     return tuple(out)
@@ -139,7 +144,7 @@ def robustness(
         PoiseError: no motion, or one that cannot be tracked without noise either.
     """
     if not motions:
-        raise PoiseError("a robustness curve needs at least one motion")
+        raise PoiseError("a robustness curve needs at least one motion", code="no-clips")
     rungs: list[Rung] = []
     refused: list[tuple[str, str, str]] = []
     for level in robustness_levels() if levels is None else levels:

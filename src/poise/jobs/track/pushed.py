@@ -60,13 +60,20 @@ class PushConfig:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.newtons <= MOST_N:
-            raise PoiseError(f"a push must be above 0 and at most {MOST_N:g} N, got {self.newtons:g}")
+            raise PoiseError(
+                f"a push must be above 0 and at most {MOST_N:g} N, got {self.newtons:g}",
+                code="out-of-range",
+            )
         if not (self.start_s >= 0.0 and 0.0 < self.seconds < math.inf):
             what = f"got {self.start_s:g} s and {self.seconds:g} s"
-            raise PoiseError(f"a push must begin at 0 s or later and last some time, {what}")
+            raise PoiseError(
+                f"a push must begin at 0 s or later and last some time, {what}", code="out-of-range"
+            )
         way = self.direction
         if way is not None and not (np.isfinite(way).all() and np.linalg.norm(way) > 0.0):
-            raise PoiseError(f"a direction must be three numbers, not all 0, got {way}")
+            raise PoiseError(
+                f"a direction must be three numbers, not all 0, got {way}", code="no-direction"
+            )
         check_level(self.level)
         if self.stiffness is not None:
             check_stiffness(self.stiffness)
@@ -134,6 +141,7 @@ def with_push(imitation: Imitation, push: PushConfig | None) -> Imitation:
         raise PoiseError(
             f"the push begins at {push.start_s:g} s, and the motion lasts {(frames - 1) / rate:.2f} s",
             hint="Let it begin earlier",
+            code="push-too-late",
         )
     row = row_of(imitation.humanoid.table, push.at)
     way = push.direction or from_the_front(imitation.humanoid, reference.qpos[first])
@@ -170,8 +178,14 @@ def row_of(table: BodyTable, at: str) -> int:
         if rows and (word not in MIDDLE or not side):
             return rows[-1]
         if not side or word not in MIDDLE:
-            raise PoiseError(f"the body has no {at.replace('_', ' ')} to push", hint=_known(names))
-    raise PoiseError(f"there is no part '{at}' to push", hint=_known(names, at))
+            raise PoiseError(
+                f"the body has no {at.replace('_', ' ')} to push",
+                hint=_known(names),
+                code="body-part-missing",
+            )
+    raise PoiseError(
+        f"there is no part '{at}' to push", hint=_known(names, at), code="unknown-body-part"
+    )
 
 
 def _known(names: list[str], at: str = "") -> str:

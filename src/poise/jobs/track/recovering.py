@@ -146,6 +146,7 @@ def led_along(
         raise PoiseError(
             f"the policy has not learned to {what[0]}",
             hint=f"{what[1]}, or train one on a library with a clip that gets up",
+            code="recovery-not-learned",
         )
     task = replace(imitation.task, help_by="all")
     env = replace(imitation, task=task).env(1, auto_reset=False, threads=1, help_scale=0.0)

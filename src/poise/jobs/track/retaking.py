@@ -83,6 +83,7 @@ def retaken(
         raise PoiseError(
             f"the part from {first / rate:.1f} s on was lost at {taken / rate:.1f} s with {TRIES} seeds",
             hint="Widen --range, raise --budget, or track the whole motion",
+            code="motion-lost",
         )
     whole = _joined(before, taken, rate)
     return _played(imitation, config, whole), [_sentence(taken, before, first, last, rate)]
@@ -99,13 +100,15 @@ def part_of(before: Simulation, retake: Retake) -> tuple[int, int]:
     end = before.frames - 1
     if first > end - 2:
         raise PoiseError(
-            f"the range begins at {retake.first_s:g} s and the motion ends at {end / rate:.2f} s"
+            f"the range begins at {retake.first_s:g} s and the motion ends at {end / rate:.2f} s",
+            code="range-beyond-end",
         )
     if before.lost is not None and first >= before.lost:
         raise PoiseError(
             f"the range begins at {retake.first_s:g} s, where the motion was already lost, at "
             f"{before.lost / rate:.1f} s",
             hint="Begin the range before that",
+            code="range-after-loss",
         )
     return first, (end if before.lost is not None else min(max(last, first + 1), end))
 

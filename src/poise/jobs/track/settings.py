@@ -69,20 +69,31 @@ class TrackConfig:
     def __post_init__(self) -> None:
         validate(self)
         if not 1 <= self.count <= MOST:
-            raise PoiseError(f"there can be 1 to {MOST} characters, got {self.count}")
+            raise PoiseError(
+                f"there can be 1 to {MOST} characters, got {self.count}", code="out-of-range"
+            )
         if self.recover and (self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that is put back onto the motion"
-            raise PoiseError(f"only a single character comes back by itself, not {what}")
+            raise PoiseError(
+                f"only a single character comes back by itself, not {what}", code="single-character-only"
+            )
         if self.controller == "search" and (self.recover or self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes or is put back"
-            raise PoiseError(f"a motion is searched for a single character, not {what}")
+            raise PoiseError(
+                f"a motion is searched for a single character, not {what}", code="single-character-only"
+            )
 
         if isinstance(self.supports, tuple) and (self.recover or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes back by itself"
-            raise PoiseError(f"supports are for a single character, not {what}")
+            raise PoiseError(
+                f"supports are for a single character, not {what}", code="single-character-only"
+            )
         if self.direction and (self.recover or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes back by itself"
-            raise PoiseError(f"weights, pins and touches are for a single character, not {what}")
+            raise PoiseError(
+                f"weights, pins and touches are for a single character, not {what}",
+                code="single-character-only",
+            )
         if self.retake is not None:
             others = {
                 "one that comes or is put back": self.recover or self.reset_on_fail,
@@ -92,7 +103,10 @@ class TrackConfig:
             }
             if any(others.values()):
                 what = next(name for name, asked in others.items() if asked)
-                raise PoiseError(f"a range is for a single character that tracks, not {what}")
+                raise PoiseError(
+                    f"a range is for a single character that tracks, not {what}",
+                    code="single-character-only",
+                )
         if self.push is not None:
             others = {
                 "one that comes or is put back": self.recover or self.reset_on_fail,
@@ -103,9 +117,15 @@ class TrackConfig:
             }
             if any(others.values()):
                 what = next(name for name, asked in others.items() if asked)
-                raise PoiseError(f"a push is for a single character that tracks, not {what}")
+                raise PoiseError(
+                    f"a push is for a single character that tracks, not {what}",
+                    code="single-character-only",
+                )
         if self.body == "own" and self.recover:
-            raise PoiseError("recovery clips are those of the policy's body, so body='own' has none")
+            raise PoiseError(
+                "recovery clips are those of the policy's body, so body='own' has none",
+                code="settings-conflict",
+            )
 
     def check(self, clips: int) -> None:
         """Refuses what cannot be done with so many clips one after another.
@@ -123,10 +143,12 @@ class TrackConfig:
             "a support is": isinstance(self.supports, tuple),
         }  # fmt: skip
         if not clips:
-            raise PoiseError("there is no clip to track")
+            raise PoiseError("there is no clip to track", code="no-clips")
         if clips > 1 and any(alone.values()):
             what = next(name for name, asked in alone.items() if asked)
-            raise PoiseError(f"{what} for a single clip, and {clips} were given")
+            raise PoiseError(
+                f"{what} for a single clip, and {clips} were given", code="single-clip-only"
+            )
 
     @property
     def looks_ahead(self) -> bool:

@@ -60,12 +60,17 @@ class Simulation:
             PoiseError: it is not of these.
         """
         if (self.bodies, self.hinges) != (tuple(humanoid.bodies), tuple(humanoid.hinges)):
-            raise PoiseError("the earlier result is of another body", hint="Track the whole motion")
+            raise PoiseError(
+                "the earlier result is of another body",
+                hint="Track the whole motion",
+                code="bodies-differ",
+            )
         if (self.frames, self.rate_hz) != (frames, rate_hz):
             raise PoiseError(
                 f"the earlier result lasts {(self.frames - 1) / self.rate_hz:.2f} s and the motion "
                 f"{(frames - 1) / rate_hz:.2f} s",
                 hint="A range needs a motion as long as the earlier one; or track the whole motion",
+                code="length-differs",
             )
 
     def save(self, path: Path) -> None:
@@ -94,6 +99,7 @@ class Retake:
             raise PoiseError(
                 f"a range must rise from 0 s, got {self.first_s:g}-{self.last_s:g}",
                 hint="Write --range 2.0-3.5",
+                code="not-rising",
             )
 
     def opened(self) -> Simulation:
@@ -115,12 +121,14 @@ def retake_of(span: str | None, of: Path | None) -> Retake | None:
         return None
     if span is None or of is None:
         what = "--from needs a --range" if span is None else "--range needs an earlier result"
-        raise PoiseError(what, hint="Write --range 2.0-3.5 --from RESULT")
+        raise PoiseError(what, hint="Write --range 2.0-3.5 --from RESULT", code="option-needs-option")
     try:
         first, last = (float(v) for v in span.split("-"))
     except ValueError:
         hint = "Write 2.0-3.5, two times in s"
-        raise PoiseError(f"--range '{span}' makes no sense", hint=hint) from None
+        raise PoiseError(
+            f"--range '{span}' makes no sense", hint=hint, code="option-malformed"
+        ) from None
     return Retake(of, first, last)
 
 
@@ -135,10 +143,11 @@ def read_simulation(path: Path) -> Simulation:
         raise PoiseError(
             "there is no simulation to go on from", file,
             "Give the folder that poise track or complete wrote for a single clip",
+            code="simulation-missing",
         )  # fmt: skip
     tensors, meta = load_checkpoint(file, _Meta)
     if meta["kind"] != "simulation":
-        raise PoiseError("the file holds no simulation", file)
+        raise PoiseError("the file holds no simulation", file, code="wrong-file-kind")
     return _checked(tensors, meta, file)
 
 
@@ -154,9 +163,14 @@ def _checked(tensors: Mapping[str, Tensor], meta: Mapping[str, Any], file: Path)
             value.ndim == 2 and len(value) == rows >= 1 and value.shape[1] == (width or value.shape[1])
         )
         if not fits or not bool(value.isfinite().all()):
-            raise PoiseError(f"the file's '{name}' is missing or damaged", file, "Track the motion anew")
+            raise PoiseError(
+                f"the file's '{name}' is missing or damaged",
+                file,
+                "Track the motion anew",
+                code="file-damaged",
+            )
     if not meta["rate_hz"] > 0:
-        raise PoiseError(f"the file states a rate of {meta['rate_hz']:g} Hz", file)
+        raise PoiseError(f"the file states a rate of {meta['rate_hz']:g} Hz", file, code="file-damaged")
     return Simulation(
         tensors["qpos"].double(), tensors["qvel"].double(), tensors["action"].float(),
         float(meta["rate_hz"]), tuple(meta["bodies"]), tuple(meta["hinges"]), meta["lost"],

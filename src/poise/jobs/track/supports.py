@@ -119,6 +119,7 @@ def _check_start(imitation: Imitation) -> None:
                     f"the motion begins with {other} {-contact.dist:.2f} m inside {box}",
                     imitation.library.names[0],
                     "Move it, or make it smaller",
+                    code="bodies-overlap",
                 )
     finally:
         env.close()

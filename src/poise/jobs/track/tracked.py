@@ -439,7 +439,9 @@ def write(
     """
     t, placed, count = tracked, tracked.placed, len(tracked.evaluation.recordings)
     if count > 1 and motion is not None:
-        raise PoiseError(f"{count} characters make {count} files", motion, "Give a folder as -o")
+        raise PoiseError(
+            f"{count} characters make {count} files", motion, "Give a folder as -o", code="folder-needed"
+        )
     other = placed.moved is not None
     inner = out / "body.bvh" if other and count == 1 else motion
     failures = tuple(

@@ -96,7 +96,9 @@ def track(
     else:
         tracker = (policy if isinstance(policy, Run) else open_run(policy)).tracker
     if not isinstance(clip, Motion | Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise PoiseError(f"a motion is a clip, keypoints, a file or several of them, got {clip!r}")
+        raise PoiseError(
+            f"a motion is a clip, keypoints, a file or several of them, got {clip!r}", code="wrong-type"
+        )
     motions = [clip] if isinstance(clip, Motion) else list(clip)
     config.check(len(motions))
     motions = [read_motion(m) for m in motions]
@@ -266,7 +268,7 @@ def _with_travel(motion: Clip | Keypoints, config: TrackConfig, several: bool) -
     made = with_travel(motion, config.in_place, repeats=single and not timed, returns=single)
     if made is not None and made.overlap is not None and config.retake is not None:
         what = "it is a loop in place, of which several periods were simulated and one is written"
-        raise PoiseError(what, motion.name, "Leave the range out")
+        raise PoiseError(what, motion.name, "Leave the range out", code="range-of-loop")
     return made
 
 

@@ -100,6 +100,7 @@ def denoise(clip: Clip) -> Clip:
                 "is no motion to be told",
                 clip.name,
                 "Cut them off; --raw takes the file as it is",
+                code="only-noise",
             )
         found = _piece(clip, root[here], rot[here], world[here], positions[here])
         if found is None:

@@ -66,6 +66,7 @@ def grounded(clip: Clip, support: Support | None, stated: float | None) -> Clip:
             "the floor cannot be guessed, since no body is told by its joints",
             clip.skeleton.source.path or clip.name,
             "State its height with --ground METRES",
+            code="floor-unknown",
         )
     height = stated if stated is not None else -support.fit.lift_m  # type: ignore[union-attr]
     how = "as stated with --ground" if stated is not None else "as guessed from its soles"

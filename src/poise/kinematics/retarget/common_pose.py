@@ -126,6 +126,7 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
             "the rest pose of this skeleton does not stand, so a motion must show how it stands",
             roles.skeleton.source.path,
             "Give a clip on it instead of the skeleton alone",
+            code="rest-pose-unknown",
         )
     return _Builder(roles, local, clip, world, at_rest is not None, evidence).build()
 
@@ -140,6 +141,7 @@ def _check_hips(roles: Roles) -> None:
             f"both legs ('{names[left]}' and '{names[right]}') hang on one point, so nothing tells "
             "where the body faces",
             roles.skeleton.source.path,
+            code="facing-unknown",
         )
 
 
@@ -245,6 +247,7 @@ class _Builder:
                 "its toes point backwards, so left and right seem to be swapped",
                 self.skeleton.source.path,
                 "State the legs by hand with --map JOINT=right_thigh and so on",
+                code="sides-swapped",
             )
 
     def _leg(self) -> float:
@@ -253,7 +256,11 @@ class _Builder:
             thigh, shin, foot = (self.pos[self._joint(f"{side}_{k}")] for k in ("thigh", "shin", "foot"))
             bones = (shin - thigh).norm(), (foot - shin).norm()
             if float(min(bones)) < 1e-4:
-                raise PoiseError(f"the {side} leg has a bone of no length", self.skeleton.source.path)
+                raise PoiseError(
+                    f"the {side} leg has a bone of no length",
+                    self.skeleton.source.path,
+                    code="zero-length-bone",
+                )
             total += float(sum(bones)) / 2
         return total
 

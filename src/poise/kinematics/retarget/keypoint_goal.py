@@ -68,6 +68,7 @@ class PointBody:
                 f"no keypoint is named {lost[0]}, so the points cannot be followed one frame at a time",
                 points.source.path or points.name,
                 "Convert the file to a clip first, which also works for marker sets",
+                code="keypoint-missing",
             )
         config = FitConfig()
         marks = complete(points, config.max_gap_s, config.drop_spikes, config.smooth_hz)
@@ -157,9 +158,11 @@ class StreamConfig:
 
     def __post_init__(self) -> None:
         if self.lookahead not in (0, 1):
-            raise PoiseError(f"a stream looks 0 or 1 control steps ahead, not {self.lookahead}")
+            raise PoiseError(
+                f"a stream looks 0 or 1 control steps ahead, not {self.lookahead}", code="out-of-range"
+            )
         if not ((self.smooth_hz is None or self.smooth_hz > 0) and self.max_speed > 0):
-            raise PoiseError("frequencies and speeds of a stream must be above 0")
+            raise PoiseError("frequencies and speeds of a stream must be above 0", code="out-of-range")
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +196,7 @@ class KeypointStream:
 
     def __init__(self, body: PointBody, rate_hz: float = 30.0, config: StreamConfig | None = None):
         if not (np.isfinite(rate_hz) and rate_hz > 0):
-            raise PoiseError(f"the control rate must be above 0, got {rate_hz}")
+            raise PoiseError(f"the control rate must be above 0, got {rate_hz}", code="out-of-range")
         self.body, self.rate_hz, self.config = body, rate_hz, config or StreamConfig()
         self.latency_s = self.config.lookahead / rate_hz
         self._gaps = Gaps(len(body.names), self.config.max_speed)
@@ -230,7 +233,9 @@ class KeypointStream:
         """
         if points.names != self.body.names:
             raise PoiseError(
-                "its keypoints are not those of the calibration", points.source.path or points.name
+                "its keypoints are not those of the calibration",
+                points.source.path or points.name,
+                code="keypoints-differ",
             )
         waiting: list[_Step] = []
         for t, positions in enumerate(points.positions):
@@ -245,10 +250,14 @@ class KeypointStream:
         """The keypoints without gaps at the control steps up to `time_s`."""
         if positions.shape != (len(self.body.names), 3):
             raise PoiseError(
-                f"a frame of this stream has shape ({len(self.body.names)}, 3), got {positions.shape}"
+                f"a frame of this stream has shape ({len(self.body.names)}, 3), got {positions.shape}",
+                code="wrong-shape",
             )
         if self._time is not None and not time_s > self._time:
-            raise PoiseError(f"the frame at {time_s:g} s is not later than the one at {self._time:g} s")
+            raise PoiseError(
+                f"the frame at {time_s:g} s is not later than the one at {self._time:g} s",
+                code="times-not-rising",
+            )
         dt = 0.0 if self._time is None else time_s - self._time
         self._time = time_s
         whole, stale = self._gaps(positions, dt)

@@ -50,7 +50,12 @@ def own_body(
     """
     config = config or BodyConfig()
     if config.mjcf is not None:
-        raise PoiseError("a body of your own keeps its lengths", config.mjcf, "Leave body='own' out")
+        raise PoiseError(
+            "a body of your own keeps its lengths",
+            config.mjcf,
+            "Leave body='own' out",
+            code="settings-conflict",
+        )
     if clip.skeleton.same_bones(example.skeleton):
         return core, example
     there = example.replaced(skeleton=own_skeleton(clip, example))
@@ -67,7 +72,10 @@ def own_table(there: Clip, core: BodyTable, config: BodyConfig) -> BodyTable:
     """
     made = generate_table(there.skeleton, config, (there,))
     if [r.name for r in made.rows] != [r.name for r in core.rows]:
-        raise PoiseError("the body was not generated from its skeleton, so its lengths are not known")
+        raise PoiseError(
+            "the body was not generated from its skeleton, so its lengths are not known",
+            code="lengths-unknown",
+        )
     rows = tuple(
         replace(new, order=old.order, frame=old.frame, quat=old.quat, ranges=old.ranges)
         for new, old in zip(made.rows, core.rows, strict=True)

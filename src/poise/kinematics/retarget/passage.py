@@ -89,7 +89,11 @@ class Passage:
         elif source.same_bones(example.skeleton, 0.0):
             here = common_pose(joints.source, example)
         else:
-            raise PoiseError("the example is on another skeleton than the source", example.name)
+            raise PoiseError(
+                "the example is on another skeleton than the source",
+                example.name,
+                code="skeleton-differs",
+            )
         there = here
         if not source.same_bones(target, 0.0):
             if shown is None and (source.names, source.parents) == (target.names, target.parents):

@@ -57,7 +57,9 @@ def body_axes(roles: Roles, pos: Tensor) -> tuple[Tensor, Tensor]:
     if roles.missing(("left_upper_arm", "right_upper_arm")):
         tops = [*roles.chain("head"), *roles.chain("neck"), *roles.chain("spine")[::-1]]
         if not tops:
-            raise PoiseError("the skeleton has neither arms nor spine above its legs")
+            raise PoiseError(
+                "the skeleton has neither arms nor spine above its legs", code="facing-unknown"
+            )
         top = pos[..., tops[0], :]
     else:
         top = (of("left_upper_arm") + of("right_upper_arm")) / 2

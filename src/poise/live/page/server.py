@@ -135,7 +135,11 @@ class PageServer:
         self._ready.wait(10.0)
         if self._problem:
             hint = "Give another --port, or stop the program that has it"
-            raise PoiseError(f"cannot listen on {guard.host}:{guard.port}: {self._problem}", hint=hint)
+            raise PoiseError(
+                f"cannot listen on {guard.host}:{guard.port}: {self._problem}",
+                hint=hint,
+                code="cannot-listen",
+            )
 
     @property
     def url(self) -> str:

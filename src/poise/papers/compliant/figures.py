@@ -97,7 +97,9 @@ def measure(
     task = standing(tracker, STANDS_S + PUSHED_S)
     hands = task.humanoid.rows_of("hand")
     if not hands:
-        raise PoiseError("the body has no hands, at which stiffness is measured")
+        raise PoiseError(
+            "the body has no hands, at which stiffness is measured", code="body-part-missing"
+        )
     asked: list[float | None] = list(commands) or [None]
     # Each hand without a force as well, once for each command.
     rows = [

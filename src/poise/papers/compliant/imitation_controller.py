@@ -119,7 +119,12 @@ class CompliantImitation:
         validate(self)
         if self.style is not None and not self.style.product:
             what = "r_imit is the product of r_q and r_p (Eq. 11)"
-            raise PoiseError(what, "CompliantImitation", "Set AmpConfig.product, as compliant() does")
+            raise PoiseError(
+                what,
+                "CompliantImitation",
+                "Set AmpConfig.product, as compliant() does",
+                code="settings-conflict",
+            )
 
     @classmethod
     def paper(cls, few: bool = True, **changes: Any) -> CompliantImitation:
@@ -159,7 +164,9 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
     if config.newtons is not None:
         hands = humanoid.rows_of("hand")
         if not hands:
-            raise PoiseError("the body has no hands to push", hint="Set newtons=None")
+            raise PoiseError(
+                "the body has no hands to push", hint="Set newtons=None", code="body-part-missing"
+            )
         hz = config.sim.control_hz
         plugins += (Pushes(config.newtons, (0.5, 1.5), 0.3, hands, hz, config.seed),)
     paid = root_place if config.style else posed_place

@@ -32,7 +32,9 @@ def at_ease(tracker: Tracker, yaw: float = 0.0) -> np.ndarray:
     """
     if tracker.recovery_clips is None:
         raise PoiseError(
-            "the policy knows no pose at ease", hint="Give a policy that was trained with recovery"
+            "the policy knows no pose at ease",
+            hint="Give a policy that was trained with recovery",
+            code="no-pose-at-ease",
         )
     qpos = tracker.recovery_clips.ease.double().numpy().copy()
     clip = qpos_to_clip(np.stack([qpos, qpos]), tracker.humanoid.table, tracker.humanoid.skeleton, 30.0)
@@ -213,7 +215,9 @@ def standing(tracker: Tracker, seconds: float) -> Imitation:
     """
     if tracker.recovery_clips is None:
         raise PoiseError(
-            "the policy knows no pose at ease", hint="Give a policy that was trained with recovery"
+            "the policy knows no pose at ease",
+            hint="Give a policy that was trained with recovery",
+            code="no-pose-at-ease",
         )
     task = imitation_of(tracker, [place(tracker.example, tracker)])
     ease = tracker.recovery_clips.ease.double().numpy()

@@ -59,7 +59,7 @@ class Opponent:
         """The plug-in of an environment."""
         if not isinstance(backend, CharacterRows) or backend.sim is None or len(backend.places) != 1:
             what = "an opponent needs a scene with one character and itself in each world"
-            raise PoiseError(what, f"Opponent '{self.name}'")
+            raise PoiseError(what, f"Opponent '{self.name}'", code="scene-needed")
         return Opposing(self, backend.sim.characters(self.name))
 
 
@@ -127,7 +127,7 @@ class Teams:
         self, envs: Mapping[str, ImitationEnv], ends: Literal["character", "world"] = "character"
     ):
         if not envs:
-            raise PoiseError("teams need at least one environment", "Teams")
+            raise PoiseError("teams need at least one environment", "Teams", code="environment-missing")
         self.envs, self.ends, self._rows = dict(envs), ends, dict[str, CharacterRows]()
         for name, env in envs.items():
             if not isinstance(env.backend, CharacterRows):
@@ -135,19 +135,24 @@ class Teams:
                     "a team's characters are those of a scene",
                     f"Teams '{name}'",
                     "Make its environment with backend=SceneSim(...).characters(...)",
+                    code="scene-needed",
                 )
             self._rows[name] = env.backend
         first = next(iter(self._rows.values()))
         self._world = first.world
         if any(rows.world is not self._world for rows in self._rows.values()):
-            raise PoiseError("teams act in one scene, these are in several", "Teams")
+            raise PoiseError(
+                "teams act in one scene, these are in several", "Teams", code="scene-differs"
+            )
         claimed = [place.name for rows in self._rows.values() for place in rows.places]
         twice = next((name for name in claimed if claimed.count(name) > 1), None)
         if twice is not None:
-            raise PoiseError(f"'{twice}' is in two teams", "Teams")
+            raise PoiseError(f"'{twice}' is in two teams", "Teams", code="name-repeated")
         self._substeps = {env.substeps for env in envs.values()}
         if len(self._substeps) != 1:
-            raise PoiseError("teams need the same physics steps per control step", "Teams")
+            raise PoiseError(
+                "teams need the same physics steps per control step", "Teams", code="rate-differs"
+            )
 
     @property
     def num_worlds(self) -> int:
@@ -166,7 +171,12 @@ class Teams:
         missing = self.envs.keys() ^ actions.keys()
         if missing:
             known = ", ".join(self.envs)
-            raise PoiseError(f"'{min(missing)}' has no action or no team", "Teams", f"Teams: {known}")
+            raise PoiseError(
+                f"'{min(missing)}' has no action or no team",
+                "Teams",
+                f"Teams: {known}",
+                code="action-missing",
+            )
         for name, env in self.envs.items():
             env.drive(actions[name])
         (substeps,) = self._substeps

@@ -155,11 +155,21 @@ def play(
     """
     if controller == "lookahead" and (learned or getattr(scene, "against", "") == "rival"):
         what = "against an opponent" if learned is None else "with what was learned on top"
-        raise PoiseError(f"lookahead does not act {what}", name or "play", "Take controller='policy'")
+        raise PoiseError(
+            f"lookahead does not act {what}",
+            name or "play",
+            "Take controller='policy'",
+            code="settings-conflict",
+        )
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
     own_motion = motion_of(scene, tracker, seconds)
     if clip is not None and own_motion is not None:
-        raise PoiseError("the scene has a motion of its own", name or "play", "Leave the clip out")
+        raise PoiseError(
+            "the scene has a motion of its own",
+            name or "play",
+            "Leave the clip out",
+            code="settings-conflict",
+        )
     clip = clip or own_motion
     task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
     rival: Imitation | None = None

@@ -192,14 +192,22 @@ class Compliant:
         validate(self)
         if self.scene not in LEARNED:
             hint = did_you_mean(self.scene, LEARNED)
-            raise PoiseError(f"the scene '{self.scene}' has no reward to learn from", hint=hint)
+            raise PoiseError(
+                f"the scene '{self.scene}' has no reward to learn from",
+                hint=hint,
+                code="scene-without-reward",
+            )
         if not 0 <= self.cooling <= 1:
-            raise PoiseError(f"cooling must lie in 0 to 1, got {self.cooling:g}", "compliant")
+            raise PoiseError(
+                f"cooling must lie in 0 to 1, got {self.cooling:g}", "compliant", code="out-of-range"
+            )
         if not 0.5 <= self.seconds <= 600.0:
-            raise PoiseError(f"episodes last 0.5 to 600 s, got {self.seconds:g}", "compliant")
+            raise PoiseError(
+                f"episodes last 0.5 to 600 s, got {self.seconds:g}", "compliant", code="out-of-range"
+            )
         if not (0.0 <= self.reach <= math.pi and (self.reach or self.added(0).forces)):
             what = "reach must lie in 0 to pi, and above 0 where there are no forces to learn"
-            raise PoiseError(f"{what}, got {self.reach:g}", "compliant")
+            raise PoiseError(f"{what}, got {self.reach:g}", "compliant", code="out-of-range")
 
     def added(self, seen: int) -> Added:
         """What is learned on top of a policy that sees so many numbers."""
@@ -282,7 +290,9 @@ def begin(folder: Path, config: Compliant) -> Compliant:
         held = _read(file)
         if held != config:
             hint = "Resume it as it is or choose another folder"
-            raise PoiseError("the folder holds a run with other settings", folder, hint)
+            raise PoiseError(
+                "the folder holds a run with other settings", folder, hint, code="settings-differ"
+            )
         return held
     folder.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps({"recipe": "compliant", "config": to_data(config)}, indent=1) + "\n")
@@ -366,16 +376,18 @@ def open_learned(folder: Path, tracker: Tracker) -> Learned:
         told = meta.get("metadata", {})
         if told.get("recipe") != "compliant" or not isinstance(told.get("config"), dict):
             hint = "Give the folder of poise train compliant, or a file that was saved from it"
-            raise PoiseError("holds nothing of the recipe compliant", folder, hint)
+            raise PoiseError("holds nothing of the recipe compliant", folder, hint, code="not-a-run")
         config = config_of(told["config"], folder)
         return _fitting(policy_in(tensors, meta, folder), config, tracker, folder)
     file = folder / RUN_FILE
     if not file.exists():
         hint = "Give the folder of poise train compliant"
-        raise PoiseError("holds no run of the recipe compliant", folder, hint)
+        raise PoiseError("holds no run of the recipe compliant", folder, hint, code="not-a-run")
     config = _read(file)
     if not (folder / LATEST).exists():
-        raise PoiseError("nothing was trained in it yet", folder, "Train it for some minutes")
+        raise PoiseError(
+            "nothing was trained in it yet", folder, "Train it for some minutes", code="nothing-trained"
+        )
     return _fitting(load_policy(folder / LATEST), config, tracker, folder)
 
 
@@ -383,7 +395,12 @@ def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Pat
     """Refuses what was trained on another body."""
     added = config.added(tracker.policy.num_obs)
     if top.num_actions != added.width(len(tracker.humanoid.hinges)):
-        raise PoiseError("it was trained on another body", folder, "Give the policy it was trained on")
+        raise PoiseError(
+            "it was trained on another body",
+            folder,
+            "Give the policy it was trained on",
+            code="bodies-differ",
+        )
     return Learned(config, top, added)
 
 
@@ -392,4 +409,6 @@ def _read(file: Path) -> Compliant:
         data = json.loads(file.read_text("utf-8"))
         return config_of(data["config"], file)
     except (ValueError, KeyError, TypeError) as problem:
-        raise PoiseError("is no run file of the recipe compliant", file) from problem
+        raise PoiseError(
+            "is no run file of the recipe compliant", file, code="wrong-file-kind"
+        ) from problem

@@ -77,7 +77,7 @@ def settings(variant: Variant = "full", budget: Budget | None = None, **changes:
     nothing, as the paper does; by default all begin from the same cloned expert (`jobs.warm_start`).
     """
     if variant not in ("uhc", "one frame", "no curriculum", "full", "full to zero"):
-        raise PoiseError(f"there is no variant '{variant}'")
+        raise PoiseError(f"there is no variant '{variant}'", code="unknown-choice")
     budget = budget or Budget()
     constant = variant in ("uhc", "no curriculum")
     stated: dict[str, Any] = {

@@ -132,10 +132,16 @@ class Report:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fps) and self.fps > 0):
-            raise PoiseError(f"the frame rate must be above 0, got {self.fps}", self.title)
+            raise PoiseError(
+                f"the frame rate must be above 0, got {self.fps}", self.title, code="rate-out-of-range"
+            )
         frames, bodies = len(self.reference.pos), len(self.bodies)
         if frames == 0 or bodies == 0:
-            raise PoiseError(f"a report needs frames and bodies, got {frames} and {bodies}", self.title)
+            raise PoiseError(
+                f"a report needs frames and bodies, got {frames} and {bodies}",
+                self.title,
+                code="no-frames",
+            )
         wanted: list[tuple[str, np.ndarray | None, tuple[int, ...]]] = [
             ("force", self.force, (frames, 3)),
             ("torque", self.torque, (frames, 3)),
@@ -150,13 +156,23 @@ class Report:
             wanted += [("a mover's pos", mover.pos, (frames, 3)), ("its quat", mover.quat, (frames, 4))]
         for name, array, shape in wanted:
             if array is not None and np.shape(array) != shape:
-                raise PoiseError(f"{name} must have shape {shape}, got {np.shape(array)}", self.title)
+                raise PoiseError(
+                    f"{name} must have shape {shape}, got {np.shape(array)}",
+                    self.title,
+                    code="wrong-shape",
+                )
         where = self.title
         for k, shape in enumerate((*self.shapes, *(m.shape for m in self.movers))):
             if shape.kind not in _KINDS:
-                raise PoiseError(f"shape {k} is a '{shape.kind}'; known: {', '.join(_KINDS)}", where)
+                raise PoiseError(
+                    f"shape {k} is a '{shape.kind}'; known: {', '.join(_KINDS)}",
+                    where,
+                    code="unknown-shape",
+                )
             if not 0 <= shape.body < bodies:
-                raise PoiseError(f"shape {k} belongs to body {shape.body} of {bodies}", where)
+                raise PoiseError(
+                    f"shape {k} belongs to body {shape.body} of {bodies}", where, code="index-outside"
+                )
 
 
 def safe_json(value: object) -> str:

@@ -321,5 +321,5 @@ def write_report(report: Report, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         what = f"its folder cannot be made ({error.strerror})"
-        raise PoiseError(what, path, "Choose another folder") from error
+        raise PoiseError(what, path, "Choose another folder", code="cannot-write") from error
     write_whole(path, render(report) + "\n")

@@ -312,7 +312,8 @@ def pose_rows(
         for pos in (row.pos, row.ghost):
             if pos is not None and (pos.shape[1:] != (len(parents), 3) or max(frames) >= len(pos)):
                 raise PoiseError(
-                    f"'{row.name}' has not the {len(parents)} joints or {max(frames)} frames"
+                    f"'{row.name}' has not the {len(parents)} joints or {max(frames)} frames",
+                    code="count-differs",
                 )
     side = _busiest(rows[0].pos if rows[0].ghost is None else rows[0].ghost)
     right = np.array([np.cos(side), np.sin(side), 0.0])

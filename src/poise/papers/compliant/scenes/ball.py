@@ -69,9 +69,11 @@ class Balance:
     def __post_init__(self) -> None:
         if not (0.1 <= self.length <= 5.0 and 0.0 <= self.spread < 1.0):
             what = f"a rod is 0.1 to 5 m long and tilted by less than 1 rad, got {self.length:g} m"
-            raise PoiseError(f"{what} and {self.spread:g} rad", "ball")
+            raise PoiseError(f"{what} and {self.spread:g} rad", "ball", code="out-of-range")
         if not 0.0 <= self.pushes < 10_000.0:
-            raise PoiseError(f"a push has at least 0 N, got {self.pushes:g}", "ball")
+            raise PoiseError(
+                f"a push has at least 0 N, got {self.pushes:g}", "ball", code="out-of-range"
+            )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The rod, its joint on the head, the fictional forces and the task's terms.
@@ -82,7 +84,11 @@ class Balance:
         heads = humanoid.rows_of("head")
         if not heads:
             names = ", ".join(humanoid.bodies)
-            raise PoiseError("the skeleton has no head, which 'ball' needs", hint=f"It has {names}")
+            raise PoiseError(
+                "the skeleton has no head, which 'ball' needs",
+                hint=f"It has {names}",
+                code="body-part-missing",
+            )
         head = heads[-1]
         pose = reference.pose
         x, y, z = (float(v) for v in pose.pos[0, head])
@@ -168,7 +174,7 @@ class Fictional:
     def __call__(self, goal: Goal, backend: Backend) -> Plugin:
         """The plug-in of an environment."""
         if not isinstance(backend, CharacterRows) or backend.sim is None:
-            raise PoiseError("'ball' needs the worlds of its scene", "ball")
+            raise PoiseError("'ball' needs the worlds of its scene", "ball", code="scene-needed")
         return FictionalForces(self, backend, backend.sim, goal)
 
 

@@ -50,6 +50,7 @@ class Hands:
             raise PoiseError(
                 "the partner's lead must be below 10 m/s, its sway below 1 m, a swing longer than 0.1 s",
                 "hands",
+                code="out-of-range",
             )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
@@ -115,10 +116,16 @@ class Chicken:
     def __post_init__(self) -> None:
         if not (2.0 <= self.mass <= 500.0 and 2.0 <= self.other <= 500.0):
             raise PoiseError(
-                f"players weigh 2 to 500 kg, got {self.mass:g} and {self.other:g}", "chicken"
+                f"players weigh 2 to 500 kg, got {self.mass:g} and {self.other:g}",
+                "chicken",
+                code="out-of-range",
             )
         if self.against not in ("bag", "rival"):
-            raise PoiseError(f"it is played against a bag or a rival, got '{self.against}'", "chicken")
+            raise PoiseError(
+                f"it is played against a bag or a rival, got '{self.against}'",
+                "chicken",
+                code="unknown-choice",
+            )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The bag, its throws and all touches with it; of a rival the touches alone."""
@@ -171,9 +178,13 @@ class Pull:
     def __post_init__(self) -> None:
         size = float(np.linalg.norm(self.direction))
         if not (0.0 < self.newtons < 1e4 and size > 0.0 and np.isfinite(size)):
-            raise PoiseError("a pull needs a force above 0 N and a direction", "pull")
+            raise PoiseError(
+                "a pull needs a force above 0 N and a direction", "pull", code="out-of-range"
+            )
         if not (self.start_s >= 0.0 and self.lasts_s > 0.0):
-            raise PoiseError("a pull begins at 0 s or later and lasts some time", "pull")
+            raise PoiseError(
+                "a pull begins at 0 s or later and lasts some time", "pull", code="out-of-range"
+            )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The force at the hand's centre of mass."""
@@ -203,7 +214,11 @@ class Throws:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mass < 100.0:
-            raise PoiseError(f"a ball must weigh above 0 and below 100 kg, got {self.mass:g}", "throws")
+            raise PoiseError(
+                f"a ball must weigh above 0 and below 100 kg, got {self.mass:g}",
+                "throws",
+                code="out-of-range",
+            )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """A ball that waits far off, touches of each body, and throws; "hit" is metered."""
@@ -245,10 +260,12 @@ class Trampoline:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.height <= 1.0:
-            raise PoiseError(f"a bounce is 0 to 1 m high, got {self.height:g}", "trampoline")
+            raise PoiseError(
+                f"a bounce is 0 to 1 m high, got {self.height:g}", "trampoline", code="out-of-range"
+            )
         if not 0.0 <= self.first < EVERY_S:
             what = f"the first bounce begins within {EVERY_S:g} s, got {self.first:g}"
-            raise PoiseError(what, "trampoline")
+            raise PoiseError(what, "trampoline", code="out-of-range")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The plate in place of the floor, its bounces, and the feet's contacts."""

@@ -56,9 +56,11 @@ class Doorway:
     def __post_init__(self) -> None:
         if not (0.0 < self.width < 10.0 and 0.0 < self.weight < 1000.0):
             what = f"a door is 0 to 10 m wide and weighs 0 to 1000 kg, got {self.width:g} m"
-            raise PoiseError(f"{what} and {self.weight:g} kg", "door")
+            raise PoiseError(f"{what} and {self.weight:g} kg", "door", code="out-of-range")
         if self.made_for is not None and not 0.5 <= self.made_for <= 3.0:
-            raise PoiseError(f"a motion is made for 0.5 to 3 m, got {self.made_for:g}", "door")
+            raise PoiseError(
+                f"a motion is made for 0.5 to 3 m, got {self.made_for:g}", "door", code="out-of-range"
+            )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The door, the weld and the task's terms.
@@ -69,7 +71,7 @@ class Doorway:
         row, broad = hand_of(humanoid, "left", "door"), breadth(humanoid, reference)
         if self.width < broad:
             what = f"the door is {self.width:g} m wide and the body {broad:.2f} m: it cannot pass"
-            raise PoiseError(what, "door", f"Give --width {broad + 0.2:.1f} or more")
+            raise PoiseError(what, "door", f"Give --width {broad + 0.2:.1f} or more", code="too-narrow")
         frame = min(round(GRIPS_S * reference.rate_hz), int(reference.length[0]) - 1)
         x, y, z = (float(v) for v in reference.pose.pos[frame, row])
         door = Door(width=self.width, mass=self.weight, knob_up=z)

@@ -70,5 +70,9 @@ def hand_of(humanoid: Humanoid, side: str, scene: str) -> int:
     if found is None:
         names = ", ".join(humanoid.bodies)
         hint = f"Its bodies are {names}"
-        raise PoiseError(f"the skeleton has no {side} hand, which '{scene}' needs", hint=hint)
+        raise PoiseError(
+            f"the skeleton has no {side} hand, which '{scene}' needs",
+            hint=hint,
+            code="body-part-missing",
+        )
     return found
