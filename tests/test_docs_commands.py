@@ -27,8 +27,9 @@ from poise.settings import to_toml
 from test_docs import WALK, _commands
 from toy_policy import toy_run
 
-#: What needs a machine of its own: a GPU, a Ray cluster.
-ELSEWHERE = ("--device cuda", "--address")
+#: What needs a machine of its own, or starts processes of its own and has a test of its own: a GPU, a Ray
+#: cluster, a fleet.
+ELSEWHERE = ("--device cuda", "--address", "poise fleet")
 #: Exit codes of a command that did what it says: done, or done but a motion was lost.
 DONE = (0, 3)
 TINY = ("--iterations", "2", "--envs", "16", "--threads", "1")
@@ -93,9 +94,6 @@ def _shortened(line: str) -> list[str]:
         argv += ["--seconds", "0.4", "--controller", "policy", "--threads", "1"]
     if "--preset" in argv:
         argv += ["--ppo.horizon", "8"]
-    if argv[0] == "fleet":
-        argv = ["walk.bvh" if word == "clips" else word for word in argv]
-        argv += ["--set", "envs=16", "--set", "iterations=1", "--workers", "2"]
     return argv
 
 
