@@ -17,9 +17,11 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
+    Annotated,
     Any,
     Literal,
     TypeGuard,
@@ -103,25 +105,210 @@ def from_data(kind: type[T], data: Any, where: Path | str | None = None) -> T:
     return _made(kind, data, "", where)
 
 
-def validate(config: Any) -> None:
-    """Refuses a settings object with a value that its fields cannot have; for `__post_init__`.
+@dataclass(frozen=True)
+class Range:
+    """The numbers that a field may have, declared with it: `share: Annotated[float, Range(0, 1)] = 0.5`.
 
-    A `Literal` field must have one of its values, and a `seed` must fit the random generators.
+    Each number of a tuple must lie in it; NaN never does.
+
+    Attributes:
+        low, high: the limits.
+        above, below: `low`, or `high`, itself is none of the numbers.
+        rising: no number of a tuple is below the one before it.
+        infinite: infinity is one of them, on a side without a limit.
+        unit: the word behind the limits, such as "kg".
+        hint: what to do about another number.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    below: bool = False
+    rising: bool = False
+    infinite: bool = False
+    unit: str = ""
+    hint: str = ""
+
+    def holds(self, number: float) -> bool:
+        """Whether a number lies in the range."""
+        if not self.low <= number <= self.high:
+            return False
+        if (self.above and number == self.low) or (self.below and number == self.high):
+            return False
+        return self.infinite or -math.inf < number < math.inf
+
+    def check(self, number: float, name: str, where: str | None = None) -> None:
+        """Refuses a number that is called `name`, by a PoiseError."""
+        if not self.holds(number):
+            raise PoiseError(f"{name} must {self}, got {number!r}", where, self.hint or None)
+
+    def __str__(self) -> str:
+        """What a number must do, as behind "must"."""
+        unit = f" {self.unit}" if self.unit else ""
+        low = f"{'above' if self.above else 'at least'} {self.low:g}"
+        high = f"{'below' if self.below else 'at most'} {self.high:g}"
+        if math.isinf(self.low) and math.isinf(self.high):
+            return "be a number" if self.infinite else "be a finite number"
+        if math.isinf(self.low) or math.isinf(self.high):
+            return f"be {low if math.isinf(self.high) else high}{unit}"
+        if self.above or self.below:
+            return f"be {low} and {high}{unit}"
+        return f"lie in {self.low:g} to {self.high:g}{unit}"
+
+
+@dataclass(frozen=True)
+class Length:
+    """How many values a field may have, declared with it: `Annotated[tuple[int, ...], Length(1)]`."""
+
+    low: int = 0
+    high: float = math.inf
+
+    def __str__(self) -> str:
+        """What a field must do, as behind "must"."""
+        many = self.low if math.isinf(self.high) else self.high
+        how = "" if self.low == self.high else "at least " if math.isinf(self.high) else "at most "
+        how = f"{self.low} to " if how == "at most " and self.low else how
+        return f"have {how}{many:g} value{'' if many == 1 else 's'}"
+
+
+#: The ranges that most fields have.
+Share = Annotated[float, Range(0, 1)]
+Positive = Annotated[float, Range(0, above=True)]
+NotNegative = Annotated[float, Range(0)]
+Count = Annotated[int, Range(1)]
+
+
+class Checked:
+    """Base of dataclasses that need no other check than `validate`."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+def validate(config: Any, where: str | None = None) -> None:
+    """Refuses a dataclass with a value that its fields do not declare; for `__post_init__`.
+
+    A `Literal` field must have one of its values. Numbers must lie in the declared `Range`; floats
+    without one must be finite. A tuple must have as many values as its type or `Length` says. A `seed`
+    must fit the random generators.
+
+    Args:
+        where: what an error calls the object; by default its class and, if it has one, its name.
 
     Raises:
-        PoiseError: another value, with the nearest one that there is.
+        PoiseError: another value, with the values that are allowed.
     """
-    own = cast("type[Any]", type(config))
-    name = own.__name__
-    for f in fields(config):
-        value, known = getattr(config, f.name), _choices(_types(own)[f.name])
-        if known and value not in known:
-            texts = [str(k) for k in known]
-            raise PoiseError(
-                f"{f.name} cannot be {_short(value)}", name, did_you_mean(str(value)[:40], texts)
-            )
-        if f.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
-            raise PoiseError(f"seed must be a whole number from 0 to 2**63 - 1, got {value!r}", name)
+    for one in _declared(cast("type[Any]", type(config))):
+        value = getattr(config, one.name)
+        what = one.refuses(value)
+        if what:
+            if where is None:
+                where, name = type(config).__name__, getattr(config, "name", None)
+                where = f"{where} '{name}'" if isinstance(name, str) else where
+            raise PoiseError(f"{one.name} {what}", where, one.hint(value))
+
+
+@dataclass(frozen=True)
+class _Declared:
+    """What one field of a dataclass declares.
+
+    Attributes:
+        choices: of a `Literal`; () where anything goes.
+        range, length: of its numbers, and of its tuple; None where anything goes.
+        none: whether it, or a value in it, may be None.
+        numeric: whether its type names numbers, and tuples of them, alone.
+    """
+
+    name: str
+    choices: tuple[Any, ...]
+    range: Range | None
+    length: Length | None
+    none: bool
+    numeric: bool
+
+    def refuses(self, value: Any) -> str:
+        """What is wrong with a value, "" where it is right."""
+        if self.choices:
+            return "" if value in self.choices else f"cannot be {_short(value)}"
+        if self.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
+            return f"must be a whole number from 0 to 2**63 - 1, got {value!r}"
+        if value is None and self.none:
+            return ""
+        range_, length = self.range, self.length
+        if range_ is not None and not self._within(value, range_):
+            rises = "rise and " if range_.rising and _is_list(value) else ""
+            each = " in each value" if _is_list(value) and not rises else ""
+            return f"must {rises}{range_}{each}, got {_short(_plain_number(value))}"
+        if length is not None and _is_list(value) and not length.low <= len(value) <= length.high:
+            return f"must {length}, got {_short(value)}"
+        return ""
+
+    def hint(self, value: Any) -> str | None:
+        """What to do about a value that is refused."""
+        if self.choices:
+            return did_you_mean(str(value)[:40], [str(c) for c in self.choices])
+        return (self.range.hint if self.range else "") or None
+
+    def _within(self, value: Any, range_: Range) -> bool:
+        if type(value) is float or type(value) is int:
+            return range_.holds(value)
+        if _is_list(value):
+            inside = all(self._within(v, range_) for v in value)
+            return inside and not (range_.rising and any(a > b for a, b in pairwise(value)))
+        if value is None:
+            return self.none
+        if self.numeric:
+            # Numbers and arrays of NumPy and of PyTorch are as their plain values.
+            own = _plain_number(value)
+            return self._within(own, range_) if type(own) in (float, int, list) else False
+        return not isinstance(value, float | int) or range_.holds(value)
+
+
+@cache
+def _declared(kind: type) -> tuple[_Declared, ...]:
+    """What the fields of a dataclass declare, without those that may be anything."""
+    hints = get_type_hints(kind, include_extras=True)
+    out: list[_Declared] = []
+    for f in fields(kind):
+        hint = hints[f.name]
+        leaves, marks = _parts(hint)
+        own = leaves - {NoneType}
+        range_ = next((m for m in marks if isinstance(m, Range)), Range() if float in own else None)
+        length = next((m for m in marks if isinstance(m, Length)), _fixed(hint))
+        choices, numeric = _choices(hint), own <= {float, int}
+        if f.init and (choices or range_ or length or f.name == "seed"):
+            out.append(_Declared(f.name, choices, range_, length, NoneType in leaves, numeric))
+    return tuple(out)
+
+
+def _parts(hint: Any) -> tuple[set[Any], list[Any]]:
+    """The types of the values in a field, tuples taken apart, and what `Annotated` adds."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        leaves, marks = _parts(args[0])
+        return leaves, [*args[1:], *marks]
+    if origin is Literal:
+        return {type(a) for a in args}, []
+    if origin not in (Union, UnionType, tuple, list):
+        return {origin or hint}, []
+    parts = [_parts(a) for a in args if a is not ...]
+    leaves: set[Any] = set[Any]().union(*(leaf for leaf, _ in parts))
+    return leaves, [m for _, marks in parts for m in marks]
+
+
+def _fixed(hint: Any) -> Length | None:
+    """How many values the tuple of a type has, None where that is left open."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _fixed(args[0])
+    if origin in (Union, UnionType):
+        return next((n for n in map(_fixed, args) if n is not None), None)
+    return Length(len(args), len(args)) if origin is tuple and args and ... not in args else None
+
+
+def _plain_number(value: Any) -> Any:
+    """Numbers and arrays of NumPy and of PyTorch as plain ones, anything else as it is."""
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def changed(config: T, settings: Mapping[str, Any]) -> T:
@@ -143,6 +330,8 @@ def _choices(kind: Any) -> tuple[Any, ...]:
     origin, args = get_origin(kind), get_args(kind)
     if origin is Literal:
         return args
+    if origin is Annotated:
+        return _choices(args[0])
     if origin in (Union, UnionType):
         own = [_choices(a) if a is not NoneType else (None,) for a in args]
         return () if () in own else tuple(v for part in own for v in part)

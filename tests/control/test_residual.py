@@ -206,10 +206,10 @@ def test_regularizers_by_hand():
 
 def test_mistakes_are_told():
     for value in (-1.0, math.inf, math.nan):
-        with pytest.raises(PoiseError, match="residual force limit must be at least 0"):
+        with pytest.raises(PoiseError, match="limit_n must be at least 0"):
             ImplicitResidual(limit_n=value)
-        with pytest.raises(PoiseError, match="residual torque limit must be at least 0"):
+        with pytest.raises(PoiseError, match="limit_nm must be at least 0"):
             ExplicitResidual(limit_nm=value)
-    for bodies in ((), (1, 1)):
-        with pytest.raises(PoiseError, match="different bodies"):
+    for bodies, said in (((), "bodies must have at least 1 value"), ((1, 1), "different bodies")):
+        with pytest.raises(PoiseError, match=said):
             ExplicitResidual(bodies)

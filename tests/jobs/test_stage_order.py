@@ -122,5 +122,5 @@ def test_switches_that_exclude_each_other_are_told() -> None:
     ):
         with pytest.raises(PoiseError, match=word):
             Perpetual(**bad)
-    with pytest.raises(PoiseError, match="share must lie in"):
+    with pytest.raises(PoiseError, match="share must be above 0 and below 1"):
         RecoveryPlan(share=1.0)

@@ -256,9 +256,9 @@ def test_a_ladder() -> None:
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    with pytest.raises(PoiseError, match="strength of Jitter must not be negative"):
+    with pytest.raises(PoiseError, match="Jitter: strength must be at least 0"):
         Jitter(strength=-1.0)
-    with pytest.raises(PoiseError, match="share of Dropouts"):
+    with pytest.raises(PoiseError, match="Dropouts: share must be"):
         Dropouts(share=float("nan"))
     with pytest.raises(PoiseError, match="axis must have a length"):
         moved(Jitter(axis=(0.0, 0.0, 0.0)), 5)

@@ -227,7 +227,7 @@ def test_prices_by_hand() -> None:
         ({"candidates": 3}, "at least 10 candidates"),
         ({"hold_steps": 20}, "hold_steps must lie in 1 to the horizon"),
         ({"noise_range": (0.3, 0.1)}, "noise_range must rise"),
-        ({"smoothing": (1.0,)}, "shares of smoothing"),
+        ({"smoothing": (1.0,)}, "smoothing must be at least 0 and below 1"),
         ({"slack": -1.0}, "at least 0"),
     ],
 )

@@ -96,7 +96,7 @@ def test_the_critic_goes_with_the_policy(tracker: Tracker, tmp_path: Path) -> No
 def test_bad_settings_are_refused() -> None:
     with pytest.raises(PoiseError, match="4 characters"):
         SamplingConfig(characters=4)
-    with pytest.raises(PoiseError, match="must be positive"):
+    with pytest.raises(PoiseError, match="noise_range must rise"):
         SamplingConfig(noise_range=(0.3, 0.1))
     with pytest.raises(PoiseError, match="searched for a single character"):
         TrackConfig(controller="search", count=2)

@@ -71,7 +71,7 @@ def test_labels_cost_less_than_what_the_learner_does(task: Imitation) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"best": 32}, "fewer best than candidates"),
+        ({"best": 32}, "best must be fewer than candidates"),
         ({"hold_steps": 9}, "hold_steps must lie in 1 to the horizon"),
         ({"noise_range": (0.0, 0.1)}, "noise_range must rise"),
         ({"jerk_price": -1.0}, "at least 0"),

@@ -116,7 +116,7 @@ def test_a_residual_force_is_left_alone(make_task) -> None:
 
 
 def test_settings_and_bodies_are_checked(make_task) -> None:
-    with pytest.raises(PoiseError, match="less lie in"):
+    with pytest.raises(PoiseError, match="less must be above 0 and below 1"):
         TrajOptConfig(less=1.0)
     with pytest.raises(PoiseError, match="must be 0"):
         TrajOptConfig(steps=(1.0, 0.5))

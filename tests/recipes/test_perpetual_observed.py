@@ -52,11 +52,11 @@ def test_settings_of_before_mean_the_twist_and_nothing_new() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"window": (1, 2)}, "window must rise from 2"),
-        ({"window": (4, 2)}, "window must rise from 2"),
-        ({"filter": 1.0}, "filter must lie in 0 to below 1"),
-        ({"foot_slide": -0.1}, "prices must be at least 0"),
-        ({"acceleration": -0.1}, "prices must be at least 0"),
+        ({"window": (1, 2)}, "window must be at least 2"),
+        ({"window": (4, 2)}, "window must rise"),
+        ({"filter": 1.0}, "filter must be at least 0 and below 1"),
+        ({"foot_slide": -0.1}, "foot_slide must be at least 0"),
+        ({"acceleration": -0.1}, "acceleration must be at least 0"),
         ({"heading": "nose"}, "heading cannot be 'nose'"),
     ],
 )

@@ -243,9 +243,9 @@ def test_real_clips_stand_where_they_stood(data_dir: Path) -> None:
 
 
 def test_bad_settings_and_bodies(imitation: Imitation) -> None:
-    with pytest.raises(PoiseError, match="1 to 1000 bodies"):
+    with pytest.raises(PoiseError, match="count must lie in 1 to 1000 bodies"):
         BodyShapes(count=0)
-    with pytest.raises(PoiseError, match="rise within"):
+    with pytest.raises(PoiseError, match="must rise"):
         BodyShapes(low=1.2, high=1.1)
     with pytest.raises(PoiseError, match="on 1 to 3 bodies, got 4"):
         BodyShapes(count=3, per_clip=4)

@@ -31,11 +31,11 @@ def test_apply_reaches_spec_and_model(name):
     [
         ({"rate_hz": 100}, r"100 Hz physics and 30 Hz control give 3.333.*rate_hz=90"),
         ({"rate_hz": 20}, r"20 Hz physics and 30 Hz control give 0.6667.*rate_hz=30"),
-        ({"integrator": "discret"}, r"unknown integrator 'discret'. Did you mean 'discrete'?"),
-        ({"cone": "round"}, "unknown cone 'round'"),
-        ({"rate_hz": 0}, "rate_hz must be above 0, got 0"),
-        ({"control_hz": float("nan")}, "control_hz must be above 0, got nan"),
-        ({"iterations": -1}, "iterations must be above 0, got -1"),
+        ({"integrator": "discret"}, r"integrator cannot be 'discret'. Did you mean 'discrete'?"),
+        ({"cone": "round"}, "cone cannot be 'round'"),
+        ({"rate_hz": 0}, "rate_hz must be above 0 and at most 20000 Hz, got 0"),
+        ({"control_hz": float("nan")}, "control_hz must be above 0 .*, got nan"),
+        ({"iterations": -1}, "iterations must be above 0 .*, got -1"),
     ],
 )
 def test_bad_settings(settings, message):

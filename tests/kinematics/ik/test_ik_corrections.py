@@ -94,9 +94,9 @@ def test_a_switch_follows_what_the_config_is_faithful_to():
     assert not any(PAPER.on(c) for c in CORRECTIONS)
     mixed = IkConfig(faithful="paper", square_ankle=True)
     assert [c for c in CORRECTIONS if mixed.on(c)] == ["square_ankle"]
-    with pytest.raises(PoiseError, match="corrected or paper"):
+    with pytest.raises(PoiseError, match="faithful cannot be 'code'"):
         IkConfig(faithful="code")
-    with pytest.raises(PoiseError, match="straight must lie"):
+    with pytest.raises(PoiseError, match="straight must be above 0"):
         IkConfig(straight=0.0)
 
 

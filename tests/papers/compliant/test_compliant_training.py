@@ -140,5 +140,5 @@ def test_scenes_that_are_not_learned(
 ) -> None:
     assert main(["train", "compliant", scene, "-o", str(tmp_path / "run")]) == 2
     assert what in capsys.readouterr().err and not (tmp_path / "run").exists()
-    with pytest.raises(PoiseError, match="reach must lie in 0 to pi"):
+    with pytest.raises(PoiseError, match="reach must be above 0"):
         Compliant(scene="door")
