@@ -13,10 +13,11 @@ import contextlib
 import dataclasses
 import json
 import math
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
@@ -129,13 +130,18 @@ class Range:
     unit: str = ""
     hint: str = ""
 
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """The least and the largest number of the range, both in it."""
+        low = math.nextafter(self.low, math.inf) if self.above else self.low
+        high = math.nextafter(self.high, -math.inf) if self.below else self.high
+        most = math.inf if self.infinite else sys.float_info.max
+        return max(low, -most), min(high, most)
+
     def holds(self, number: float) -> bool:
         """Whether a number lies in the range."""
-        if not self.low <= number <= self.high:
-            return False
-        if (self.above and number == self.low) or (self.below and number == self.high):
-            return False
-        return self.infinite or -math.inf < number < math.inf
+        low, high = self.limits
+        return low <= number <= high
 
     def check(self, number: float, name: str, where: str | None = None) -> None:
         """Refuses a number that is called `name`, by a PoiseError."""
@@ -176,6 +182,8 @@ Share = Annotated[float, Range(0, 1)]
 Positive = Annotated[float, Range(0, above=True)]
 NotNegative = Annotated[float, Range(0)]
 Count = Annotated[int, Range(1)]
+#: Of what is limited, infinite for no limit.
+Limit = Annotated[float, Range(0, infinite=True)]
 
 
 class Checked:
@@ -198,14 +206,17 @@ def validate(config: Any, where: str | None = None) -> None:
     Raises:
         PoiseError: another value, with the values that are allowed.
     """
-    for one in _declared(cast("type[Any]", type(config))):
-        value = getattr(config, one.name)
+    for one, name, low, high in _declared(cast("type[Any]", type(config))):
+        value = getattr(config, name)
+        kind = type(value)
+        if (kind is float or kind is int) and low <= value <= high:
+            continue  # Most fields are done here.
         what = one.refuses(value)
         if what:
             if where is None:
-                where, name = type(config).__name__, getattr(config, "name", None)
-                where = f"{where} '{name}'" if isinstance(name, str) else where
-            raise PoiseError(f"{one.name} {what}", where, one.hint(value))
+                where, called = type(config).__name__, getattr(config, "name", None)
+                where = f"{where} '{called}'" if isinstance(called, str) else where
+            raise PoiseError(f"{name} {what}", where, one.hint(value))
 
 
 @dataclass(frozen=True)
@@ -215,16 +226,20 @@ class _Declared:
     Attributes:
         choices: of a `Literal`; () where anything goes.
         range, length: of its numbers, and of its tuple; None where anything goes.
+        inner: of each tuple in its tuple.
         none: whether it, or a value in it, may be None.
         numeric: whether its type names numbers, and tuples of them, alone.
+        listed: whether its type names tuples alone.
     """
 
     name: str
     choices: tuple[Any, ...]
     range: Range | None
     length: Length | None
+    inner: Length | None
     none: bool
     numeric: bool
+    listed: bool
 
     def refuses(self, value: Any) -> str:
         """What is wrong with a value, "" where it is right."""
@@ -234,13 +249,24 @@ class _Declared:
             return f"must be a whole number from 0 to 2**63 - 1, got {value!r}"
         if value is None and self.none:
             return ""
-        range_, length = self.range, self.length
-        if range_ is not None and not self._within(value, range_):
-            rises = "rise and " if range_.rising and _is_list(value) else ""
-            each = " in each value" if _is_list(value) and not rises else ""
-            return f"must {rises}{range_}{each}, got {_short(_plain_number(value))}"
-        if length is not None and _is_list(value) and not length.low <= len(value) <= length.high:
+        if self.numeric and type(value) is not tuple:
+            # Numbers and arrays of NumPy and of PyTorch are as their plain values.
+            value = _plain_number(value)
+        if not _is_list(value):
+            if self.listed:
+                return f"must {self.length or 'be a tuple'}, got {_short(value)}"
+            return "" if self._within(value) else f"must {self.range}, got {_short(value)}"
+        rising = self.range is not None and self.range.rising
+        if not self._within(value):
+            each = "" if rising else " in each value"
+            return f"must {'rise and ' * rising}{self.range}{each}, got {_short(value)}"
+        if rising and any(a > b for a, b in pairwise(value)):
+            return f"must rise and {self.range}, got {_short(value)}"
+        length, inner = self.length, self.inner
+        if length is not None and not length.low <= len(value) <= length.high:
             return f"must {length}, got {_short(value)}"
+        if inner is not None and not all(_is_list(v) and len(v) == inner.low for v in value):
+            return f"must hold tuples that {inner}, got {_short(value)}"
         return ""
 
     def hint(self, value: Any) -> str | None:
@@ -249,35 +275,41 @@ class _Declared:
             return did_you_mean(str(value)[:40], [str(c) for c in self.choices])
         return (self.range.hint if self.range else "") or None
 
-    def _within(self, value: Any, range_: Range) -> bool:
-        if type(value) is float or type(value) is int:
-            return range_.holds(value)
+    def _within(self, value: Any) -> bool:
+        """Whether all numbers of a value lie in the range."""
+        if self.range is None:
+            return True
+        if isinstance(value, float | int):
+            return self.range.holds(value)
         if _is_list(value):
-            inside = all(self._within(v, range_) for v in value)
-            return inside and not (range_.rising and any(a > b for a, b in pairwise(value)))
-        if value is None:
-            return self.none
-        if self.numeric:
-            # Numbers and arrays of NumPy and of PyTorch are as their plain values.
-            own = _plain_number(value)
-            return self._within(own, range_) if type(own) in (float, int, list) else False
-        return not isinstance(value, float | int) or range_.holds(value)
+            low, high = self.range.limits
+            return all(low <= v <= high if type(v) is float else self._within(v) for v in value)
+        return self.none if value is None else not self.numeric
 
 
 @cache
-def _declared(kind: type) -> tuple[_Declared, ...]:
-    """What the fields of a dataclass declare, without those that may be anything."""
+def _declared(kind: type) -> tuple[tuple[_Declared, str, float, float], ...]:
+    """What the fields of a dataclass declare, but for those that may be anything: each with its name and
+    the limits of a plain number."""
     hints = get_type_hints(kind, include_extras=True)
-    out: list[_Declared] = []
+    out: list[tuple[_Declared, str, float, float]] = []
     for f in fields(kind):
         hint = hints[f.name]
         leaves, marks = _parts(hint)
         own = leaves - {NoneType}
         range_ = next((m for m in marks if isinstance(m, Range)), Range() if float in own else None)
         length = next((m for m in marks if isinstance(m, Length)), _fixed(hint))
-        choices, numeric = _choices(hint), own <= {float, int}
-        if f.init and (choices or range_ or length or f.name == "seed"):
-            out.append(_Declared(f.name, choices, range_, length, NoneType in leaves, numeric))
+        inner = next((n for n in map(_fixed, _items(hint)) if n is not None), None)
+        choices, listed = _choices(hint), _listed(hint)
+        if not f.init or not (choices or range_ or length or inner or f.name == "seed"):
+            continue
+        one = _Declared(
+            f.name, choices, range_, length, inner, NoneType in leaves, own <= {float, int}, listed
+        )
+        # Where a plain number is not enough, no number lies between the limits.
+        plain = range_ is not None and not (listed or choices or f.name == "seed")
+        low, high = range_.limits if range_ is not None and plain else (math.inf, -math.inf)
+        out.append((one, f.name, low, high))
     return tuple(out)
 
 
@@ -304,6 +336,24 @@ def _fixed(hint: Any) -> Length | None:
     if origin in (Union, UnionType):
         return next((n for n in map(_fixed, args) if n is not None), None)
     return Length(len(args), len(args)) if origin is tuple and args and ... not in args else None
+
+
+def _listed(hint: Any) -> bool:
+    """Whether a type names tuples alone, or None."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _listed(args[0])
+    if origin in (Union, UnionType):
+        return all(_listed(a) for a in args if a is not NoneType)
+    return origin is tuple
+
+
+def _items(hint: Any) -> tuple[Any, ...]:
+    """The type of the values of a `tuple[..., ...]`."""
+    args = get_args(hint)
+    if get_origin(hint) is Annotated:
+        return _items(args[0])
+    return args[:1] if get_origin(hint) is tuple and ... in args else ()
 
 
 def _plain_number(value: Any) -> Any:

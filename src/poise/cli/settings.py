@@ -33,7 +33,7 @@ SOURCES = {
 }
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Those with a range, in `poise.settings`.
-_TYPES |= {"Share": float, "Positive": float, "NotNegative": float, "Count": int}
+_TYPES |= {"Share": float, "Positive": float, "NotNegative": float, "Count": int, "Limit": float}
 #: Of fields that need no entry in a recipe.
 _UNSAID = {
     "num_envs": "environments that are simulated at once.",

@@ -28,7 +28,7 @@ from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_
 from poise.learn.protocols import DemoSampler, FeatureSource
 from poise.learn.rollout import TrainingError, check_finite
 from poise.learn.windows import History, WindowBuffer
-from poise.settings import Checked, Count, Positive, Share
+from poise.settings import Checked, Count, Limit, Positive, Share
 
 
 class Discriminator(nn.Module):
@@ -95,7 +95,7 @@ class AmpConfig(Checked):
     """Widths of the discriminator's hidden layers."""
     activation: str = "relu"
     """relu, silu, gelu, elu or tanh."""
-    clip: float = 5.0
+    clip: Limit = 5.0
     """Normalised features are clipped to +-clip."""
     loss: Loss = "bce"
     """bce as in PHC's code, or least_squares: (D - 1)^2 and (D + 1)^2 with the reward

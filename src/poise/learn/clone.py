@@ -248,7 +248,7 @@ class LessonConfig(Checked):
     """Labels of each."""
     lr: Positive = 5e-5
     """Adam's step size."""
-    grad_norm: Positive = 1.0
+    grad_norm: Annotated[float, Range(0, above=True, infinite=True)] = 1.0
     """Gradients are scaled down to this norm."""
     reinforce: bool = False
     """Whether PPO trains the policy, too; without, it trains the critic alone."""

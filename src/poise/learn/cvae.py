@@ -335,7 +335,7 @@ class CVAETraining(Checked):
     noise: float = 0.05
     mix: float = 0.4
     settle: Positive = 5.0
-    grad_norm: Positive = 1.0
+    grad_norm: Annotated[float, Range(0, above=True, infinite=True)] = 1.0
     products: Literal["auto", "float32", "bfloat16"] = "auto"
 
     @classmethod

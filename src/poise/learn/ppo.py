@@ -44,7 +44,7 @@ from poise.learn.parallel import (
 )
 from poise.learn.policy import PolicyBundle
 from poise.learn.rollout import Rollout, TrainingError
-from poise.settings import Count, NotNegative, Positive, Range, Share, validate
+from poise.settings import Count, Limit, NotNegative, Positive, Range, Share, validate
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class PPOConfig:
     """Adam's step size for the policy: 2e-4 from scratch, 1e-4 after a warm start."""
     value_lr: Positive = 5e-4
     """Adam's step size for the critic."""
-    policy_grad_norm: float | None = 40.0
+    policy_grad_norm: Limit | None = 40.0
     """The policy's gradient is scaled down to this norm; None leaves it."""
-    value_grad_norm: float | None = None
+    value_grad_norm: Limit | None = None
     """The same for the critic."""
     policy_hidden: tuple[int, ...] = (256, 128)
     """Widths of the policy's hidden layers."""
@@ -85,7 +85,7 @@ class PPOConfig:
     """Weight of the entropy bonus; it matters only with a learned deviation."""
     bound_weight: float = 0.0
     """Weight of the squared excess of the mean action over +-bound_limit."""
-    bound_limit: float = 1.0
+    bound_limit: Limit = 1.0
     """Mean actions inside +-bound_limit cost nothing."""
     smooth_weight: NotNegative = 0.0
     """Weight of KL(pi(s) || pi(s + n)), with n of `smooth_noise`: what makes the policy answer alike to
@@ -95,13 +95,13 @@ class PPOConfig:
     smooth_over: Annotated[tuple[int, int], Range(0)] | None = None
     """First column of the observations in which n is not 0, and the first after them; None: a recipe
     that knows better says which, else all."""
-    kl_target: float | None = None
+    kl_target: Limit | None = None
     """With a number, the policy's lr follows the KL per update (summed over the actions): divided
     by 1.5 above twice the target, multiplied by 1.5 below half of it. Use 0.03 to 0.1: with 38
     actions a target of 0.01 drives the lr to its floor at once and nothing is learned."""
     lr_range: Annotated[tuple[float, float], Range(0, above=True, rising=True)] = (1e-5, 1e-3)
     """Bounds of the adaptive lr."""
-    kl_stop: float | None = 1.0
+    kl_stop: Limit | None = 1.0
     """The remaining epochs train only the critic once an epoch's mean KL exceeds this. Healthy
     updates stay under 0.1; a step that destroys the policy reaches 10."""
     critic_warmup: int = 0
@@ -113,7 +113,7 @@ class PPOConfig:
     float32 gives the same numbers on processors with and without."""
     normalise_returns: bool = True
     """The critic learns returns scaled to mean 0 and deviation 1 (PopArt, van Hasselt 2016)."""
-    obs_clip: float = 5.0
+    obs_clip: Limit = 5.0
     """Normalised observations are clipped to +-obs_clip."""
     norm_warmup: int = 16
     """Control steps before the first iteration that only gather the statistics of observations;

@@ -19,7 +19,7 @@ from poise.metrics import has_lost
 from poise.metrics.plausibility import foot_contacts, jerk
 from poise.metrics.shapes import Shapes, foot_points
 from poise.plan.sampling import draw_offsets
-from poise.settings import Count, Length, NotNegative, Positive, Range, Share, validate
+from poise.settings import Count, Length, NotNegative, Range, Share, validate
 
 #: m/s^3, the mean jerk below which a reference counts as calm.
 CALM = 50.0
@@ -240,7 +240,7 @@ class LookaheadConfig:
     jerk_price: NotNegative = 0.5
     slide_price: NotNegative = 12.0
     slack: NotNegative = 1.5
-    strict_m: Positive = 0.25
+    strict_m: Annotated[float, Range(0, above=True, infinite=True)] = 0.25
     discount: Annotated[float, Range(0, 1, above=True)] = 0.97
     seed: int = 0
 

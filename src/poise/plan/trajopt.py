@@ -19,7 +19,7 @@ from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.plan.expert import ExpertConfig, make_plan
 from poise.plan.lqr import Regulator, driven, linearise, regulate
-from poise.settings import Positive, Range, validate
+from poise.settings import Limit, Positive, Range, validate
 from poise.sim import CpuBackend, SimConfig, alone, difference
 
 
@@ -69,10 +69,10 @@ class TrajOptConfig:
     less: Annotated[float, Range(0, 1, above=True, below=True)] = 0.6
     least: float = 0.02
     good: float = 4.0
-    bad: float = 10.0
-    astray: float = 25.0
+    bad: Limit = 10.0
+    astray: Limit = 25.0
     steps: tuple[float, ...] = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
-    lost: float = 1.2
+    lost: Limit = 1.2
     blur: int = 3
     plan: ExpertConfig = field(default_factory=ExpertConfig)
 

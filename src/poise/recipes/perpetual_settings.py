@@ -24,6 +24,7 @@ from poise.settings import (
     Checked,
     Count,
     Length,
+    Limit,
     Migration,
     NotNegative,
     Range,
@@ -88,7 +89,7 @@ class PushPlan(Checked):
     newtons: tuple[float, float] = (20.0, 200.0)
     every_s: tuple[float, float] = (0.3, 2.0)
     lasts_s: tuple[float, float] = (0.1, 2.0)
-    impulse_ns: float = 50.0
+    impulse_ns: Limit = 50.0
     parts: Annotated[tuple[str, ...], Length(1)] = ("pelvis", "spine", "head", "hand", "upper_arm")
     level: tuple[float, float] = (0.0, 0.2)
 

@@ -20,7 +20,7 @@ from poise.kinematics.repair.estimate import clean_clip
 from poise.kinematics.repair.needs import AloneRules, leaps, longest_alone, not_alone
 from poise.kinematics.travel import find_travel, travelled
 from poise.motion import Clip, Skeleton, resample, shifted, trim
-from poise.settings import Range, validate
+from poise.settings import Limit, Range, validate
 
 State = Literal["kept", "cut", "left out"]
 
@@ -171,7 +171,7 @@ class LibraryConfig:
     min_cut_s: float = 1.0
     rules: AloneRules = field(default_factory=AloneRules)
     words: tuple[str, ...] = WORDS
-    max_unlike_deg: float = 20.0
+    max_unlike_deg: Limit = 20.0
     keep: tuple[str, ...] = ()
     leave_out: tuple[str, ...] = ()
     skeletons: tuple[tuple[str, str], ...] = ()

@@ -154,7 +154,7 @@ class StreamConfig(Checked):
 
     smooth_hz: Positive | None = None
     lookahead: Annotated[int, Range(0, 1, unit="control steps")] = 1
-    max_speed: Positive = 25.0
+    max_speed: Annotated[float, Range(0, above=True, infinite=True)] = 25.0
 
 
 @dataclass(frozen=True, eq=False)
