@@ -207,9 +207,8 @@ def validate(config: Any, where: str | None = None) -> None:
         PoiseError: another value, with the values that are allowed.
     """
     for one, name, low, high in _declared(cast("type[Any]", type(config))):
-        value = getattr(config, name)
-        kind = type(value)
-        if (kind is float or kind is int) and low <= value <= high:
+        value: object = getattr(config, name)
+        if (type(value) is float or type(value) is int) and low <= value <= high:
             continue  # Most fields are done here.
         what = one.refuses(value)
         if what:

@@ -28,7 +28,7 @@ def test_targets_by_hand():
     drive.clear()
     PDTargets("absolute", offset=torch.tensor([0.5, 0.5])).apply(action, ref, drive)
     torch.testing.assert_close(drive.ctrl, torch.tensor([[0.6, 0.3]]))
-    with pytest.raises(PoiseError, match="additive or absolute"):
+    with pytest.raises(PoiseError, match="mode cannot be 'relative'"):
         PDTargets("relative")
 
 
