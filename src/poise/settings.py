@@ -263,7 +263,7 @@ class _Declared:
             return f"must rise and {self.range}, got {_short(value)}"
         length, inner = self.length, self.inner
         if length is not None and not length.low <= len(value) <= length.high:
-            return f"must {length}, got {_short(value)}"
+            return f"must {length}, got {_short(value) if len(value) < 9 else len(value)}"
         if inner is not None and not all(_is_list(v) and len(v) == inner.low for v in value):
             return f"must hold tuples that {inner}, got {_short(value)}"
         return ""

@@ -350,7 +350,7 @@ def test_links_of_bodies_far_apart() -> None:
 
 
 def test_mistakes_get_a_sentence(humanoid: Humanoid, tmp_path: Path) -> None:
-    with pytest.raises(PoiseError, match="at most 500 things, got 10000"):
+    with pytest.raises(PoiseError, match="things must have at most 500 values, got 10000"):
         Scene(tuple(Box(f"b{k}") for k in range(10_000)))
     with pytest.raises(PoiseError, match="two of its things are called 'box'"):
         Scene((Box(), Box()))

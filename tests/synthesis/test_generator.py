@@ -209,7 +209,7 @@ def test_what_makes_no_sense_is_refused(
     other = GeneratorModel(model.net, model.seeds, model.bounds, ("a",), 30.0)
     with pytest.raises(PoiseError, match="another body"):
         other.generator(tracker.humanoid)
-    with pytest.raises(PoiseError, match="past 2 frames"):
+    with pytest.raises(PoiseError, match="past must be at least 2 frames"):
         CVAEConfig(past=1)
 
 
