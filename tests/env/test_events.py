@@ -131,7 +131,7 @@ def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> 
     [
         ({"newtons": (5.0, 1.0)}, "newtons must rise"),
         ({"every_s": (-1.0, 1.0)}, "every_s must rise and be at least 0 s"),
-        ({"lasts_s": 0.0}, "must rise and be above 0"),
+        ({"lasts_s": 0.0}, "lasts_s must be above 0"),
         ({"bodies": ()}, "bodies must have at least 1 value"),
         ({"lasts_s": (0.5, 0.2)}, "must rise and be above 0"),
         ({"share": 1.5}, "share must lie in 0 to 1"),
