@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv, Reference
+from poise.errors import PoiseError
 from poise.metrics import mpjpe_global
 from poise.plan import LqrTeacher, TrajectoryOptimizer, TrajOptConfig
 from poise.plan.trajopt import segments
@@ -116,7 +117,7 @@ def test_a_residual_force_is_left_alone(make_task) -> None:
 
 
 def test_settings_and_bodies_are_checked(make_task) -> None:
-    with refused("out-of-range", says="less"):
+    with pytest.raises(PoiseError, match="less must be above 0 and below 1"):
         TrajOptConfig(less=1.0)
     with refused("out-of-range"):
         TrajOptConfig(steps=(1.0, 0.5))

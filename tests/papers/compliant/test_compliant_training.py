@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from poise.cli.main import main
+from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
@@ -140,5 +141,5 @@ def test_scenes_that_are_not_learned(
 ) -> None:
     assert main(["train", "compliant", scene, "-o", str(tmp_path / "run")]) == 2
     assert what in capsys.readouterr().err and not (tmp_path / "run").exists()
-    with refused("out-of-range", says="reach"):
+    with pytest.raises(PoiseError, match="reach must be above 0"):
         Compliant(scene="door")
