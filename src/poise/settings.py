@@ -146,7 +146,9 @@ class Range:
     def check(self, number: float, name: str, where: str | None = None) -> None:
         """Refuses a number that is called `name`, by a PoiseError."""
         if not self.holds(number):
-            raise PoiseError(f"{name} must {self}, got {number!r}", where, self.hint or None)
+            raise PoiseError(
+                f"{name} must {self}, got {number!r}", where, self.hint or None, code="out-of-range"
+            )
 
     def __str__(self) -> str:
         """What a number must do, as behind "must"."""
@@ -215,7 +217,8 @@ def validate(config: Any, where: str | None = None) -> None:
             if where is None:
                 where, called = type(config).__name__, getattr(config, "name", None)
                 where = f"{where} '{called}'" if isinstance(called, str) else where
-            raise PoiseError(f"{name} {what}", where, one.hint(value), code="out-of-range")
+            code = "unknown-choice" if one.choices else "out-of-range"
+            raise PoiseError(f"{name} {what}", where, one.hint(value), code=code)
 
 
 @dataclass(frozen=True)

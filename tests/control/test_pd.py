@@ -11,11 +11,11 @@ import torch
 
 from poise.body import BodyConfig
 from poise.control import PDTargets, stable_pd_torque
-from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.kinematics import fit_humanoid
 from poise.motion import trim
 from poise.sim import Drive, SimConfig
+from refusals import refused
 
 
 def test_targets_by_hand():
@@ -28,7 +28,7 @@ def test_targets_by_hand():
     drive.clear()
     PDTargets("absolute", offset=torch.tensor([0.5, 0.5])).apply(action, ref, drive)
     torch.testing.assert_close(drive.ctrl, torch.tensor([[0.6, 0.3]]))
-    with pytest.raises(PoiseError, match="mode cannot be 'relative'"):
+    with refused("unknown-choice", says=("mode", "relative")):
         PDTargets("relative")
 
 

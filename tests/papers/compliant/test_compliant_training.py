@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from poise.cli.main import main
-from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
@@ -141,5 +140,5 @@ def test_scenes_that_are_not_learned(
 ) -> None:
     assert main(["train", "compliant", scene, "-o", str(tmp_path / "run")]) == 2
     assert what in capsys.readouterr().err and not (tmp_path / "run").exists()
-    with pytest.raises(PoiseError, match="reach must be above 0"):
+    with refused("out-of-range", says="reach"):
         Compliant(scene="door")
