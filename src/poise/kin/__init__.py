@@ -2,8 +2,8 @@
 
 from poise.kin.coords import clip_to_qpos, qpos_to_clip, qpos_velocity
 from poise.kin.cycle import close_cycle, cycle_step, cycle_velocity
-from poise.kin.doctor.clean import clean_clip, find_faults, without_noise
-from poise.kin.doctor.doctor import Examination, examine, heal
+from poise.kin.doctor.clean import clean_clip, find_faults
+from poise.kin.doctor.doctor import Examination, examine, heal, without_noise
 from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.guesses import find_guesses, grounded
 from poise.kin.doctor.sides import swap_sides

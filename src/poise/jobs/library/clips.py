@@ -16,6 +16,7 @@ from poise.jobs.library.report import ClipNote
 from poise.kin import RetargetConfig, onto_own, own_body, place_on_body
 from poise.kin.doctor.alone import AloneRules, leaps, longest_alone, not_alone
 from poise.kin.doctor.clean import clean_clip
+from poise.kin.doctor.doctor import without_noise
 from poise.kin.place import OnBody
 from poise.kin.rate.judge import judge_rate
 from poise.kin.rate.reading import read_clip
@@ -150,7 +151,9 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
         )
         note = replace(note, seconds=clip.seconds, notes=clip.skeleton.source.notes)
         rule = "not human"
-        cleaned, report = clean_clip(clip)
+        calm, noise = without_noise(clip)
+        cleaned, report = clean_clip(calm, raw=True)
+        report = noise.then(report)
         travel = find_travel(cleaned)
         cleaned = cleaned if travel is None else travelled(cleaned, travel)
         rule = "short"

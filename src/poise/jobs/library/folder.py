@@ -42,7 +42,7 @@ from poise.motion.mirror import mirrored_clip
 from poise.motion.pack import pack_clips, unpack_clips
 
 #: Grows whenever the same files and settings would give other clips.
-VERSION = 4
+VERSION = 5
 
 
 class Split(NamedTuple):
@@ -64,7 +64,7 @@ def library_of(
 ) -> tuple[ClipLibrary, LibraryReport]:
     """Every clip of folders and files on one skeleton, cleaned, on the floor z = 0, at one rate.
 
-    Each clip is read, cleaned (`clean_clip`), resampled, retargeted where its skeleton has other joints
+    Each clip is read, cleaned (`without_noise`, `clean_clip`), resampled, retargeted where its skeleton has other joints
     or bone lengths (`retarget`), and lifted as a whole so that its feet stand (`fit_heights`). What no
     humanoid can do alone is cut off or left out: unreadable or no human, shorter than `min_frames`, in
     flight with another gravity, held above the floor, leaning on nothing, on several floors, a telling

@@ -36,6 +36,11 @@ class CleanReport:
     def __bool__(self) -> bool:
         return bool(self.flips or self.speeds or self.left or self.kept or self.noise)
 
+    def then(self, later: CleanReport) -> CleanReport:
+        """The repairs of a clip that was repaired once more: both, and what is left after that."""
+        both = self.flips + later.flips, self.speeds + later.speeds
+        return CleanReport(*both, later.left, later.kept, self.noise + later.noise)
+
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
         out = self.noise_sentences()
@@ -114,16 +119,6 @@ def clean_clip(
     if any(f.kind == "tremble" for f in found):
         slowed = denoise(slowed)
     return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, tuple(found))
-
-
-def without_noise(clip: Clip) -> tuple[Clip, CleanReport]:
-    """The clip without its noise and with its lost joints filled in, and nothing else changed; as it is
-    where its source is raw."""
-    if clip.skeleton.source.raw:
-        return clip, CleanReport()
-    found, whole = noise_faults(clip)
-    calm = denoise(whole) if any(f.kind == "tremble" for f in found) else whole
-    return calm, CleanReport(noise=tuple(found))
 
 
 @dataclass(frozen=True)
