@@ -32,10 +32,10 @@ TOLD_M = 0.02
 class Placed:
     """A motion on a tracker's body.
 
-    source: as it came. calm: what is followed in its place, on its own skeleton, `without_noise`. clip: on the body's skeleton, at the source's rate. qpos: `(T, 7 + n)` at the
-    control rate, on the floor. report: what fitting did. moved: how it was retargeted, None where it is
-    on the body's skeleton already. level: how its feet were turned to stand flat. notes: what else is to
-    be said.
+    source: as it came. calm: what is followed in its place, on its own skeleton (`without_noise`).
+    clip: on the body's skeleton, at the source's rate. qpos: `(T, 7 + n)` at the control rate, on the
+    floor. report: what fitting did. moved: how it was retargeted, None where it is on the body's
+    skeleton already. level: how its feet were turned to stand flat. notes: what else is to be said.
     """
 
     source: Clip

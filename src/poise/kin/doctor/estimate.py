@@ -201,8 +201,8 @@ def find_lost(clip: Clip, rot: np.ndarray, noisy: bool = False) -> list[Lost]:
 
     A "spike" lasts a frame or two and turns the joint by `SPIKE_RAD` or more; a joint is "held" that
     stands still and then leaps to where it has got. A spike that the next joints undo is none: what
-    hangs on it would leap without. rot: `(T, J, 4)`, continuous in sign. noisy: smaller spikes are looked
-    for as well, as they are wherever large ones are many.
+    hangs on it would leap without. rot: `(T, J, 4)`, continuous in sign. noisy: smaller spikes are
+    looked for as well, as they are wherever large ones are many.
     """
     spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
     sure = np.zeros_like(spikes)

@@ -9,7 +9,8 @@ and a chain of two states joins the frames. The s are those of the frames that s
 them: the more noise is left, the faster and the higher may an end be that stands.
 
 Feet roll and pivot where they stand. Beyond what they do, q, the speed s is noise: an end bears by
-(s^2 / q^2 - 1) to the power of `STEEP`.
+(s^2 / q^2 - 1) to the power of `STEEP`. A foot rolls over its own length each time it stands, so that q
+is larger where that is short, as in a run.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from torch import Tensor
 from poise.kin.doctor.support import Support
 from poise.kin.feet.contact import Sole
 from poise.kin.feet.hold import Standing, hold
+from poise.kin.series import find_runs
 from poise.motion import Clip
 
 #: What an end of a sole does that stands (deviations): m/s level, by axis, and of its rise; m of height.
@@ -32,6 +34,8 @@ WIDER = 3.0
 ALIKE_S, LASTS_S = 0.1, 0.4
 #: How often both are told, and how surely an end stands that bears: the power of its probability.
 TOLD_ROUNDS, SURE = 4, 3
+#: How long (s) an end stands at least that rolls as slowly as above.
+ROLLS_S = 0.3
 #: See the module's text: how much an end bears, at most, and how that grows.
 BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 
@@ -39,8 +43,9 @@ BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 def steadied(clip: Clip, support: Support) -> Clip:
     """The clip with its feet held while they stand; see the module's text."""
     stands, level, rise = stance(support)
-    firm, upright = (_firm(s / q) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
-    weight = torch.tensor(firm * stands**SURE)
+    firm, upright = (float(_firm(s / q)) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
+    rolls = np.maximum(ROLLS_S * support.fps / _lasting(stands), 1.0)
+    weight = torch.tensor(_firm(level / (LEVEL_SPEED * rolls)) * stands**SURE)
     if firm <= 0.0 or not bool(weight.any()):
         return clip
 
@@ -89,9 +94,18 @@ def stance(support: Support) -> tuple[np.ndarray, float, float]:
     return stands, level, rise
 
 
-def _firm(share: float) -> float:
+def _firm(share: float | np.ndarray) -> np.ndarray:
     """How much an end bears that is so many times as fast as those without noise are."""
-    return min(MOST, BEARS * max(share**2 - 1.0, 0.0) ** STEEP)
+    return np.minimum(MOST, BEARS * np.maximum(np.square(share) - 1.0, 0.0) ** STEEP)
+
+
+def _lasting(stands: np.ndarray) -> np.ndarray:
+    """`(T, F)` frames, how long each end stands around every frame by `stands (T, F)`; 1 elsewhere."""
+    out = np.ones_like(stands)
+    for k in range(stands.shape[1]):
+        for a, b in find_runs(stands[:, k] > 0.5, 0):
+            out[a : b + 1, k] = b - a + 1
+    return out
 
 
 def _joined(ratio: np.ndarray, change: float) -> np.ndarray:
