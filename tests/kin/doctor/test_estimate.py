@@ -12,10 +12,14 @@ import torch
 from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
-from poise.kin import examine, heal
+from poise.kin import anatomy_of, examine, heal, support_of
 from poise.kin.doctor import clean
 from poise.kin.doctor.clean import clean_clip
 from poise.kin.doctor.estimate import denoise, find_lost, noise_faults, refill
+from poise.kin.doctor.faults import Fault
+from poise.kin.doctor.slides import mend_slides
+from poise.kin.doctor.stance import _lasting
+from poise.kin.doctor.support import slide_faults
 from poise.motion import Clip, read_clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.points import fit_clip
@@ -263,6 +267,29 @@ def test_a_foot_that_trembles_little_keeps_its_roll(walk: Clip) -> None:
     assert off_mm(held, walk) < 1.1 * off_mm(loose, walk)
     before, after = (_ankle_slide(c, walk) for c in (walk, held))
     assert after < before + 20.0
+
+
+def test_a_foot_that_swings_through_near_the_floor_is_not_held(walk: Clip) -> None:
+    # It stands, is 0.2 m on after 0.1 s, and stands there.
+    frames = 40
+    path = np.repeat(walk.root_pos[:1], frames, axis=0)
+    path[:, 0] += 0.2 * np.clip((np.arange(frames) - 18) / 3, 0.0, 1.0)
+    clip = walk.replaced(root_pos=path, rot=np.repeat(walk.rot[:1], frames, axis=0))
+    support = support_of(clip, anatomy_of(clip))
+    assert support is not None
+    feet = {f.joint for f in slide_faults(clip, support)}
+    assert feet
+    faults = [Fault("foot slide", foot, 0, frames - 1, 20.0) for foot in feet]
+    assert off_mm(mend_slides(clip, support, faults), clip) < 0.1
+
+
+def test_a_run_is_held_less_than_a_walk() -> None:
+    t = np.arange(120) / 30.0
+    stands = np.stack([np.sin(2 * np.pi * hz * t) > 0 for hz in (0.5, 2.5)], 1).astype(float)
+    lasting = _lasting(stands)
+    # A second, and a fifth of one; nothing elsewhere.
+    assert lasting[5, 0] == pytest.approx(30, abs=1) and lasting[3, 1] == pytest.approx(6, abs=1)
+    assert (lasting[stands < 0.5] == 1).all()
 
 
 def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:

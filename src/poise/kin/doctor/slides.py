@@ -16,6 +16,8 @@ from poise.motion import Clip
 #: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
 #: (m/s) that a rolling sole has anyway and that is left.
 COMMON_S, ROLL_SPEED = 0.4, 0.04
+#: What is faster (m/s) swings through, or skates, and is not held.
+SWING_SPEED = 1.0
 #: The path drifts only where soles lie flat for so long (s) and slip with no more than this share of
 #: unsteadiness, each foot for this time (s) in all, and one foot tells this share of the other's slips.
 FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
@@ -97,9 +99,11 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
 def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     """The clip with every sliding foot held in place while it stands, its leg bent to follow (`hold`).
 
-    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`.
+    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`, but where
+    they swing through.
     """
-    contact, weights = support.contacts[1], {}
+    speed, contact = support.contacts
+    contact, weights = contact & (speed <= SWING_SPEED), {}
     for foot in dict.fromkeys(support.feet):
         mine = [k for k, joint in enumerate(support.feet) if joint == foot]
         slides = torch.zeros(clip.frames - 1, 1, dtype=torch.bool)
