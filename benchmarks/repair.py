@@ -311,7 +311,16 @@ def clean_rows(data: Path, count: int) -> Iterator[tuple[str, str, list[float]]]
 def track_rows(
     clips: list[Clip], kinds: Iterable[str], sizes: Iterable[float]
 ) -> Iterator[tuple[str, str, list[float]]]:
-    """Dirt that `poise track` follows: motion done to its end, beside the estimate that it follows."""
+    """Dirt that `poise track` follows: motion done to its end, beside the estimate that it follows, and
+    beside what it makes of the truth."""
+    whole = [track(clip) for clip in clips]
+    yield "truth", "done", [float(np.mean([not made.failures for made in whole]))]
+    ours = [
+        measured(made.clip.positions(), clip) if made.clip.frames == clip.frames else None
+        for made, clip in zip(whole, clips, strict=True)
+    ]
+    for metric in ("distance_mm", "end_mm", "slide_more_mm_per_s", "jerk_ratio"):
+        yield "truth", f"tracked: {metric}", [one[metric] for one in ours if one]
     for kind in kinds:
         for mm in sizes if kind != "dropouts" else (0.0,):
             told: dict[str, list[float]] = {}
@@ -322,8 +331,12 @@ def track_rows(
                 told.setdefault("done", []).append(float(not made.failures))
                 for name, one in parts.items():
                     if one.frames == clip.frames:
-                        for metric, value in measured(one.positions(), clip).items():
+                        found = measured(one.positions(), clip)
+                        for metric, value in found.items():
                             told.setdefault(f"{name}: {metric}", []).append(value)
+                        if name == "tracked" and (own := ours[k]) and estimate.frames == clip.frames:
+                            more = found["distance_mm"] - own["distance_mm"] - off_mm(estimate, clip)
+                            told.setdefault("tracked: mm beyond truth's and estimate's", []).append(more)
             told["done"] = [float(np.mean(told["done"]))]
             for metric, values in told.items():
                 yield (f"{kind} {mm:g} mm" if mm else kind), metric, values
@@ -418,6 +431,9 @@ def main() -> None:
             clips, o.only or (kinds if points else [*KINDS, "dropouts", "all"]), sizes, points
         )
         command = f"{command} --as {o.form}"
+    command += f" --clips {o.clips}" if o.clips != CLIPS else ""
+    command += f" --only {' '.join(o.only)}" if o.only else ""
+    command += f" --sizes {' '.join(f'{x:g}' for x in o.sizes)}" if o.sizes != SIZES_MM else ""
     write(o.out, rows, f"{command} -o results/{o.out.name}")
 
 

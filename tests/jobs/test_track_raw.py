@@ -15,7 +15,7 @@ from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.kinematics import Kinematics, clean_clip, examine, without_noise
+from poise.kinematics import Kinematics, clean_clip, examine, heal, sole_slide, without_noise
 from poise.metrics import mpjpe_root
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
@@ -68,6 +68,23 @@ def test_a_raw_motion_is_followed_as_it_is(tracker: Tracker, shaky: Clip) -> Non
     tracked = track(raw_of(shaky), tracker, controller="policy")
     assert not tracked.card.raw and "raw" not in tracked.card.to_dict()
     assert not any("tremble" in n for n in tracked.notes)
+
+
+def test_the_goal_is_what_the_doctor_makes_of_a_trembling_motion(tracker: Tracker, shaky: Clip) -> None:
+    healed, followed = heal(shaky), place(shaky, tracker)
+    np.testing.assert_array_equal(followed.calm.rot, healed.rot)
+    np.testing.assert_array_equal(followed.calm.root_pos, healed.root_pos)
+    np.testing.assert_array_equal(followed.qpos, place(raw_of(healed), tracker).qpos)
+    # Noise alone taken off, feet go on sliding.
+    assert sole_slide(followed.calm) < 0.8 * sole_slide(clean_clip(shaky)[0])
+
+
+def test_the_goal_of_a_clean_motion_is_that_motion(tracker: Tracker) -> None:
+    with as_file(files("poise") / "data/walk.bvh") as path:
+        walk = read_clip(path)
+    followed = place(walk, tracker)
+    assert without_noise(walk)[0] is walk and followed.calm.rot is walk.rot
+    np.testing.assert_array_equal(followed.qpos, place(raw_of(walk), tracker).qpos)
 
 
 def test_a_clean_motion_has_no_raw_score(tracker: Tracker) -> None:

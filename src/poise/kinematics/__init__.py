@@ -12,8 +12,8 @@ from poise.kinematics.ik_frames import CORRECTIONS, IkConfig
 from poise.kinematics.limbs import limb_of, match_positions, two_bone
 from poise.kinematics.loops import close_cycle, cycle_step, cycle_velocity
 from poise.kinematics.place import place_on_body
-from poise.kinematics.repair.doctor import Examination, examine, heal
-from poise.kinematics.repair.estimate import clean_clip, find_faults, without_noise
+from poise.kinematics.repair.doctor import Examination, examine, heal, without_noise
+from poise.kinematics.repair.estimate import clean_clip, find_faults
 from poise.kinematics.repair.faults import Fault, by_kind
 from poise.kinematics.repair.guesses import find_guesses, grounded
 from poise.kinematics.repair.support import anatomy_of, sole_slide, support_of

@@ -152,7 +152,7 @@ def fit_humanoid(
         ClipFit(
             c.name,
             judge_rate(c, table),
-            replace(found, noise=n.noise),
+            n.then(found),
             p.cycle,
             p.ground,
             p.joint_error_mm,

@@ -297,6 +297,8 @@ def _too_fast(
 #: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
 #: (m/s) that a rolling sole has anyway and that is left.
 COMMON_S, ROLL_SPEED = 0.4, 0.04
+#: What is faster (m/s) swings through, or skates, and is not held.
+SWING_SPEED = 1.0
 #: The path drifts only where soles lie flat for so long (s) and slip with no more than this share of
 #: unsteadiness, each foot for this time (s) in all, and one foot tells this share of the other's slips.
 FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
@@ -378,9 +380,11 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
 def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     """The clip with every sliding foot held in place while it stands, its leg bent to follow (`hold`).
 
-    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`.
+    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`, but where
+    they swing through.
     """
-    contact, weights = support.contacts[1], {}
+    speed, contact = support.contacts
+    contact, weights = contact & (speed <= SWING_SPEED), {}
     for foot in dict.fromkeys(support.feet):
         mine = [k for k, joint in enumerate(support.feet) if joint == foot]
         slides = torch.zeros(clip.frames - 1, 1, dtype=torch.bool)
@@ -410,6 +414,8 @@ WIDER = 3.0
 ALIKE_S, LASTS_S = 0.1, 0.4
 #: How often both are told, and how surely an end stands that bears: the power of its probability.
 TOLD_ROUNDS, SURE = 4, 3
+#: How long (s) an end stands at least that rolls as slowly as above.
+ROLLS_S = 0.3
 #: See the module's text: how much an end bears, at most, and how that grows.
 BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 
@@ -417,8 +423,9 @@ BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 def steadied(clip: Clip, support: Support) -> Clip:
     """The clip with its feet held while they stand; see the module's text."""
     stands, level, rise = stance(support)
-    firm, upright = (_firm(s / q) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
-    weight = torch.tensor(firm * stands**SURE)
+    firm, upright = (float(_firm(s / q)) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
+    rolls = np.maximum(ROLLS_S * support.fps / _lasting(stands), 1.0)
+    weight = torch.tensor(_firm(level / (LEVEL_SPEED * rolls)) * stands**SURE)
     if firm <= 0.0 or not bool(weight.any()):
         return clip
 
@@ -467,9 +474,18 @@ def stance(support: Support) -> tuple[np.ndarray, float, float]:
     return stands, level, rise
 
 
-def _firm(share: float) -> float:
+def _firm(share: float | np.ndarray) -> np.ndarray:
     """How much an end bears that is so many times as fast as those without noise are."""
-    return min(MOST, BEARS * max(share**2 - 1.0, 0.0) ** STEEP)
+    return np.minimum(MOST, BEARS * np.maximum(np.square(share) - 1.0, 0.0) ** STEEP)
+
+
+def _lasting(stands: np.ndarray) -> np.ndarray:
+    """`(T, F)` frames, how long each end stands around every frame by `stands (T, F)`; 1 elsewhere."""
+    out = np.ones_like(stands)
+    for k in range(stands.shape[1]):
+        for a, b in find_runs(stands[:, k] > 0.5, 0):
+            out[a : b + 1, k] = b - a + 1
+    return out
 
 
 def _joined(ratio: np.ndarray, change: float) -> np.ndarray:

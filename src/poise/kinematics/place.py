@@ -14,7 +14,8 @@ from poise.kinematics.feet import Levelled, level_feet
 from poise.kinematics.forward import Kinematics, lowest_height
 from poise.kinematics.ground import GroundFit, fit_ground
 from poise.kinematics.loops import Cycle, join_cycle
-from poise.kinematics.repair.estimate import CleanReport, clean_clip, without_noise
+from poise.kinematics.repair.doctor import without_noise
+from poise.kinematics.repair.estimate import CleanReport, clean_clip
 from poise.kinematics.retarget.retarget_report import RetargetReport
 from poise.kinematics.retarget.transfer import RetargetConfig, retarget
 from poise.motion import Clip, ClipLibrary, Skeleton, resample
@@ -27,8 +28,8 @@ CYCLE_SINK_M = 0.1
 class OnBody:
     """A clip on a body.
 
-    moved: the clip on the body's skeleton, at its own rate, without its noise, else neither cleaned nor
-        levelled.
+    calm: what is followed in the clip's place, on its own skeleton (`without_noise`).
+    moved: the same on the body's skeleton, at its own rate, else neither cleaned nor levelled.
     clip: the same, cleaned and levelled as was asked for.
     qpos: `(T, 7 + hinges)`, in the body's coordinates at the rate that was asked for, on the floor.
     retargeting: how it came onto the skeleton, None where its bones are the body's.
@@ -38,6 +39,7 @@ class OnBody:
         before a cycle was closed: turns that a chain of hinges cannot make.
     """
 
+    calm: Clip
     moved: Clip
     clip: Clip
     qpos: np.ndarray
@@ -72,8 +74,8 @@ def place_on_body(
         rate_hz: of the coordinates; by default the clip's own.
         example: a clip on the source's skeleton that shows how it stands, see `retarget`.
         how: it is retargeted.
-        clean: repair flips and impossible speeds, and take noise off unless the clip's source is raw
-            (`clean_clip`).
+        clean: repair flips and impossible speeds (`clean_clip`), first of all what noise did, unless the
+            clip's source is raw (`without_noise`).
         level: turn feet that stand on their edge flat (`level_feet`).
         near: shift hinges by whole turns as near to this humanoid's ranges as can be.
         join: make the ends of a cyclic clip meet (`join_cycle`), unless that sinks it into the floor.
@@ -90,7 +92,7 @@ def place_on_body(
     if onto is not None and skeleton is not None and not clip.skeleton.same_bones(skeleton):
         moved, retargeting = retarget(calm, onto, config=how, example=example)
     made, cleaned = clean_clip(moved, raw=True) if clean else (moved, CleanReport())
-    cleaned = replace(cleaned, noise=noise.noise)
+    cleaned = noise.then(cleaned)
     turned = level_feet(made, table) if level else Levelled({})
     made = turned.onto(made)
     timed = made if rate_hz is None else resample(made, rate_hz)
@@ -102,7 +104,7 @@ def place_on_body(
     qpos, cycle = _join(qpos, table) if join and clip.cyclic else (qpos, None)
     closed = cycle is not None and cycle.closed
     qpos, ground = fit_ground(qpos, table, timed.fps, closed, known=known)
-    return OnBody(moved, made, qpos, retargeting, cleaned, turned, ground, cycle, error)
+    return OnBody(calm, moved, made, qpos, retargeting, cleaned, turned, ground, cycle, error)
 
 
 def calm_library(library: ClipLibrary) -> tuple[ClipLibrary, list[CleanReport]]:

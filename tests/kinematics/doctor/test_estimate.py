@@ -13,9 +13,12 @@ from scipy.signal import butter, sosfiltfilt
 
 from poise.formats import read_clip
 from poise.formats.point_fit import fit_clip
-from poise.kinematics import examine, heal
+from poise.kinematics import anatomy_of, examine, heal, support_of
+from poise.kinematics.hold import _lasting, mend_slides
 from poise.kinematics.repair import estimate as clean
 from poise.kinematics.repair.estimate import clean_clip, denoise, find_lost, noise_faults, refill
+from poise.kinematics.repair.faults import Fault
+from poise.kinematics.repair.support import slide_faults
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
@@ -145,6 +148,21 @@ def test_spikes_and_held_joints_are_filled_in(walk: Clip) -> None:
     np.testing.assert_allclose(refill(broken).positions()[others], walk.positions()[others], atol=1e-9)
 
 
+@pytest.mark.parametrize("frame", [0, 1, 2, -3, -2, -1])
+def test_a_trembling_clip_loses_its_spikes_at_either_end(walk: Clip, frame: int) -> None:
+    # 20 degrees of a joint that carries the trunk; too little to be sure of in a clip without noise.
+    spine = walk.skeleton.index("Spine")
+    shaken = dirty(walk, 8.0, tone(5.0))
+    rot = unwrap_quats(torch.tensor(shaken.rot))
+    leap = rotvec_to_quat(torch.tensor([0.35, 0.0, 0.0], dtype=torch.float64))
+    rot[frame, spine] = quat_mul(rot[frame, spine], leap)
+    found, whole = noise_faults(shaken.replaced(rot=rot.numpy()))
+    at = frame % walk.frames
+    assert [(f.joint, f.start) for f in found if f.kind == "spike"] == [("Spine", at)]
+    off = np.linalg.norm(denoise(whole).positions() - walk.positions(), axis=-1)[at].mean()
+    assert off < 0.012
+
+
 def test_what_is_missing_lies_on_the_smoothest_curve() -> None:
     t = np.arange(60) / 30.0
     known = np.ones(60, dtype=bool)
@@ -247,6 +265,29 @@ def test_a_foot_that_trembles_little_keeps_its_roll(walk: Clip) -> None:
     assert off_mm(held, walk) < 1.1 * off_mm(loose, walk)
     before, after = (_ankle_slide(c, walk) for c in (walk, held))
     assert after < before + 20.0
+
+
+def test_a_foot_that_swings_through_near_the_floor_is_not_held(walk: Clip) -> None:
+    # It stands, is 0.2 m on after 0.1 s, and stands there.
+    frames = 40
+    path = np.repeat(walk.root_pos[:1], frames, axis=0)
+    path[:, 0] += 0.2 * np.clip((np.arange(frames) - 18) / 3, 0.0, 1.0)
+    clip = walk.replaced(root_pos=path, rot=np.repeat(walk.rot[:1], frames, axis=0))
+    support = support_of(clip, anatomy_of(clip))
+    assert support is not None
+    feet = {f.joint for f in slide_faults(clip, support)}
+    assert feet
+    faults = [Fault("foot slide", foot, 0, frames - 1, 20.0) for foot in feet]
+    assert off_mm(mend_slides(clip, support, faults), clip) < 0.1
+
+
+def test_a_run_is_held_less_than_a_walk() -> None:
+    t = np.arange(120) / 30.0
+    stands = np.stack([np.sin(2 * np.pi * hz * t) > 0 for hz in (0.5, 2.5)], 1).astype(float)
+    lasting = _lasting(stands)
+    # A second, and a fifth of one; nothing elsewhere.
+    assert lasting[5, 0] == pytest.approx(30, abs=1) and lasting[3, 1] == pytest.approx(6, abs=1)
+    assert (lasting[stands < 0.5] == 1).all()
 
 
 def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:

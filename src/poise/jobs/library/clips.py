@@ -16,6 +16,7 @@ from poise.jobs.library.files import MotionFile, check_patterns, matches
 from poise.kinematics import RetargetConfig, onto_own, own_body, place_on_body
 from poise.kinematics.place import OnBody
 from poise.kinematics.rate import judge_rate, read_clip
+from poise.kinematics.repair.doctor import without_noise
 from poise.kinematics.repair.estimate import clean_clip
 from poise.kinematics.repair.needs import AloneRules, leaps, longest_alone, not_alone
 from poise.kinematics.travel import find_travel, travelled
@@ -264,7 +265,9 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
         )
         note = replace(note, seconds=clip.seconds, notes=clip.skeleton.source.notes)
         rule = "not human"
-        cleaned, report = clean_clip(clip)
+        calm, noise = without_noise(clip)
+        cleaned, report = clean_clip(calm, raw=True)
+        report = noise.then(report)
         travel = find_travel(cleaned)
         cleaned = cleaned if travel is None else travelled(cleaned, travel)
         rule = "short"

@@ -42,7 +42,7 @@ from poise.motion.clip import backwards
 from poise.motion.windows import mirrored_clip
 
 #: Grows whenever the same files and settings would give other clips.
-VERSION = 4
+VERSION = 5
 
 
 class Split(NamedTuple):
@@ -64,11 +64,11 @@ def library_of(
 ) -> tuple[ClipLibrary, LibraryReport]:
     """Every clip of folders and files on one skeleton, cleaned, on the floor z = 0, at one rate.
 
-    Each clip is read, cleaned (`clean_clip`), resampled, retargeted where its skeleton has other joints
-    or bone lengths (`retarget`), and lifted as a whole so that its feet stand (`fit_heights`). What no
-    humanoid can do alone is cut off or left out: unreadable or no human, shorter than `min_frames`, in
-    flight with another gravity, held above the floor, leaning on nothing, on several floors, a telling
-    word in its name. The longest run of frames without such a spell stays.
+    Each clip is read, cleaned (`without_noise`, `clean_clip`), resampled, retargeted where its skeleton
+    has other joints or bone lengths (`retarget`), and lifted as a whole so that its feet stand
+    (`fit_heights`). What no humanoid can do alone is cut off or left out: unreadable or no human,
+    shorter than `min_frames`, in flight with another gravity, held above the floor, leaning on nothing,
+    on several floors, a telling word in its name. The longest run of frames without such a spell stays.
 
     Args:
         onto: the skeleton, a clip on it, a motion file, an MJCF body (`.xml`), or a skeleton with its

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +22,7 @@ from poise.formats.point_raw import RawPoints, assemble_points
 from poise.formats.point_tables import csv_points, trc_points
 from poise.formats.raw import ReadOptions as Options
 from poise.jobs.tracker import Tracker
-from poise.kinematics import (
-    FitReport,
-    RetargetConfig,
-    RetargetReport,
-    place_on_body,
-    retarget,
-    without_noise,
-)
+from poise.kinematics import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
 from poise.kinematics.feet import Levelled
 from poise.kinematics.fit import ClipFit
 from poise.kinematics.rate import judge_rate
@@ -43,30 +35,28 @@ from poise.motion.rotations import quat_between, quat_mul
 
 #: Angles (rad) beyond a joint's range that are worth a sentence.
 BEYOND = math.radians(1.0)
+#: How far (m) the root may be from the file's without a word.
+TOLD_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
     """A motion on a tracker's body.
 
-    source: as it came. clip: on the body's skeleton, at the source's rate. qpos: `(T, 7 + n)` at the
-    control rate, on the floor. report: what fitting did. moved: how it was retargeted, None where it is
-    on the body's skeleton already. level: how its feet were turned to stand flat. notes: what else is to
-    be said.
+    source: as it came. calm: what is followed in its place, on its own skeleton (`without_noise`).
+    clip: on the body's skeleton, at the source's rate. qpos: `(T, 7 + n)` at the control rate, on the
+    floor. report: what fitting did. moved: how it was retargeted, None where it is on the body's
+    skeleton already. level: how its feet were turned to stand flat. notes: what else is to be said.
     """
 
     source: Clip
+    calm: Clip
     clip: Clip
     qpos: np.ndarray
     report: FitReport
     moved: RetargetReport | None
     level: Levelled
     notes: tuple[str, ...]
-
-    @cached_property
-    def calm(self) -> Clip:
-        """The source without the noise that was taken off: joints without a body move as in it."""
-        return without_noise(self.source)[0] if self.report.clips[0].clean.noise else self.source
 
 
 def place(clip: Clip, tracker: Tracker) -> Placed:
@@ -80,8 +70,8 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     on = place_on_body(clip, humanoid.table, tracker.example, rate, how=tracker.onto, near=humanoid)
     fit = ClipFit(clip.name, judge_rate(clip), on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
-    notes = (*_read_noise(clip), *on.cleaned.noise_sentences(), *notes)
-    return Placed(clip, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
+    notes = (*_read_noise(clip), *on.cleaned.noise_sentences(), *_root_told(clip, on.calm), *notes)
+    return Placed(clip, on.calm, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
 
 
 def _read_noise(clip: Clip) -> tuple[str, ...]:
@@ -90,6 +80,14 @@ def _read_noise(clip: Clip) -> tuple[str, ...]:
         f"The keypoints tremble by {f.size:.0f} mm {f.detail}: the tremble is taken off."
         for f in noise_read(clip)
     )
+
+
+def _root_told(clip: Clip, calm: Clip) -> tuple[str, ...]:
+    """A sentence on the root of what is followed in a clip's place, where it is elsewhere."""
+    most = 0.0 if calm is clip else float(np.linalg.norm(calm.root_pos - clip.root_pos, axis=-1).max())
+    if most < TOLD_M:
+        return ()
+    return (f"The root of the motion that is followed is up to {most * 1000:.0f} mm from the file's.",)
 
 
 def noise_read(clip: Clip) -> list[Fault]:

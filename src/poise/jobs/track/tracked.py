@@ -388,7 +388,7 @@ class Tracked(Result):
         if self.placed.moved is not None:
             motion = home(motion, self.placed, self.tracker).replaced(name=motion.name)
         if hold:
-            motion = pinned(motion, self.pins) if self.pins else settled(motion, self.placed.source)
+            motion = pinned(motion, self.pins) if self.pins else settled(motion, self.placed.calm)
         return motion if self.retake is None else self._as_it_was(motion, self.retake, hold)
 
     def _as_it_was(self, motion: Clip, retake: Retake, hold: bool) -> Clip:

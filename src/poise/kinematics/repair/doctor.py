@@ -16,7 +16,7 @@ from poise.kinematics.coords import chain_angles
 from poise.kinematics.hold import drifts, mend_path, mend_slides, steadied
 from poise.kinematics.loops import best_period, overlap_of, repeated
 from poise.kinematics.rate import judge_rate
-from poise.kinematics.repair.estimate import CleanReport, clean_clip, noise_faults
+from poise.kinematics.repair.estimate import CleanReport, clean_clip, denoise, noise_faults
 from poise.kinematics.repair.faults import KINDS, Fault, by_kind, read_faults, spell_faults
 from poise.kinematics.repair.speeds import jitter_faults, mend_jitter
 from poise.kinematics.repair.support import Support, anatomy_of, height_faults, slide_faults, support_of
@@ -131,6 +131,27 @@ def heal(clip: Clip, path: bool | None = None, found: Examination | None = None)
         return clip
     period = clip.frames - overlap
     return best_period(in_place(healed, travel), period, overlap, first=1).replaced(cyclic=clip.cyclic)
+
+
+def without_noise(clip: Clip) -> tuple[Clip, CleanReport]:
+    """The motion that a noisy clip was recorded of, which is followed in its place, and what was done.
+
+    Where noise or lost joints are told, or reading took them off keypoints, it is what `heal` gives:
+    standing feet are held, too, and the path is freed of the drift that both tell. Where that has other
+    frames it is the clip without its noise alone. Any other clip comes back as it is, one with a raw
+    source too.
+    """
+    if clip.skeleton.source.raw:
+        return clip, CleanReport()
+    found, whole = noise_faults(clip)
+    if not found and not any(f.kind == "tremble" for f in read_faults(clip)):
+        return clip, CleanReport()
+    cleaned, report = clean_clip(clip, anatomy_of(clip), rougher=False)
+    healed = heal(clip, found=Examination((), {}, False, cleaned=(clip, cleaned, report)))
+    if healed.frames != clip.frames:
+        calm = denoise(whole) if any(f.kind == "tremble" for f in found) else whole
+        return calm, CleanReport(noise=tuple(found))
+    return healed, replace(report, left=(), kept=())
 
 
 def _supports(anatomy: Anatomy, clip: Clip, support: Support | None) -> Callable[[Clip], Support | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,10 @@ SPIKE_RAD, SPIKE_M = 0.35, 0.06
 #: Without a spike the places of what hangs on its joint are smoother by this factor at least.
 CALMER = 0.7
 #: Smaller spikes are told as well if this share of all joints and frames leaps for certain: so many
-#: times the usual roughness, this angle (rad) at least, in so many rounds.
+#: times the usual roughness, this angle (rad) at least, in so many rounds. Where less leaps, but all
+#: trembles, by this angle.
 MANY_SPIKES, SMALL_TIMES, SMALL_RAD, SPIKE_ROUNDS = 1e-3, 5.0, 0.02, 3
+FEW_RAD = 0.1
 #: A tremble is looked for in what is faster than this (Hz), of axes that turn by more than this (rad).
 SLOW_HZ, STILL_RAD = 0.7, 1e-5
 #: White noise (mm) that leaves nothing of a motion.
@@ -131,26 +134,36 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     fitted = any(kind == "tremble" for kind, *_ in clip.skeleton.source.mended)
     lost = [] if fitted else find_lost(clip, rot)
     whole = refill(clip, lost)
+    trembles = _trembles(whole)
+    if trembles and not fitted:
+        lost = find_lost(clip, rot, noisy=True)
+        whole = refill(clip, lost)
+        trembles = _trembles(whole)
     turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
     out = [
         Fault(kind, clip.skeleton.names[j], a, b, float(turned[a : b + 1, j].max()))
         for kind, j, a, b in lost
     ]
-    positions, calm = whole.positions(), unwrap_quats(torch.tensor(whole.rot)).numpy()
-    groups, trembles = np.repeat(np.arange(len(clip.skeleton)), 3), list[Fault]()
+    if trembles:
+        worst = max(trembles, key=lambda f: f.size)
+        out.append(replace(worst, start=trembles[0].start, stop=trembles[-1].stop))
+    return out, whole
+
+
+def _trembles(clip: Clip) -> list[Fault]:
+    """The tremble of every piece of a clip without lost joints that has one."""
+    positions, calm = clip.positions(), unwrap_quats(torch.tensor(clip.rot)).numpy()
+    groups, out = np.repeat(np.arange(len(clip.skeleton)), 3), list[Fault]()
     for here in pieces(clip.frames, clip.fps):
         first, last, places = here.start, here.stop - 1, positions[here]
         hz = _tremble_hz(calm[here], clip.fps)
         if hz is not None:
             found = Spectrum.of(places.reshape(len(places), -1), clip.fps, groups)
             size = 1e3 * math.sqrt(float(found.tone(hz)[0].mean()))
-            trembles.append(Fault.tremble(first, last, size, hz))
+            out.append(Fault.tremble(first, last, size, hz))
         elif (white := white_mm(places, clip.fps)) >= WHITE_MM:
-            trembles.append(Fault.tremble(first, last, white, None))
-    if trembles:
-        worst = max(trembles, key=lambda f: f.size)
-        out.append(replace(worst, start=trembles[0].start, stop=trembles[-1].stop))
-    return out, whole
+            out.append(Fault.tremble(first, last, white, None))
+    return out
 
 
 def _piece(
@@ -196,12 +209,13 @@ def _white_of(clip: Clip, root: np.ndarray, rot: np.ndarray) -> float:
     return white_mm(posed(clip.skeleton.parents, clip.skeleton.offsets, root, unit)[0], clip.fps)
 
 
-def find_lost(clip: Clip, rot: np.ndarray) -> list[Lost]:
+def find_lost(clip: Clip, rot: np.ndarray, noisy: bool = False) -> list[Lost]:
     """(kind, joint, first, last frame) where joints were not seen as they were.
 
     A "spike" lasts a frame or two and turns the joint by `SPIKE_RAD` or more; a joint is "held" that
     stands still and then leaps to where it has got. A spike that the next joints undo is none: what
-    hangs on it would leap without. rot: `(T, J, 4)`, continuous in sign.
+    hangs on it would leap without. rot: `(T, J, 4)`, continuous in sign. noisy: smaller spikes are
+    looked for as well, as they are wherever large ones are many.
     """
     spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
     sure = np.zeros_like(spikes)
@@ -212,11 +226,15 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[Lost]:
         for a, b in find_runs(spikes[:, j], 0):
             sure[a : b + 1, j] = turned[a : b + 1].max() >= least
     out = _leaping(clip, rot, sure)
-    if sum(b - a + 1 for _, _, a, b in out) >= MANY_SPIKES * sure.size:
+    many = sum(b - a + 1 for _, _, a, b in out) >= MANY_SPIKES * sure.size
+    if noisy or many:
         sure[:] = False
         for _, j, a, b in out:
             sure[a : b + 1, j] = True
-        out = _leaping(clip, rot, sure | _small_spikes(rot, sure, clip.fps))
+        # Where leaps are few, only what carries other joints can be told from noise.
+        carries = np.isin(np.arange(rot.shape[1]), clip.skeleton.parents) | many
+        least = SMALL_RAD if many else FEW_RAD
+        out = _leaping(clip, rot, sure | (_small_spikes(rot, sure, clip.fps, least) & carries))
     still = (rot[1:] == rot[:-1]).all(-1)
     step, reach = np.linalg.norm(np.diff(rot, axis=0), axis=-1), max(3, round(0.2 * clip.fps))
     for j in np.flatnonzero(still.any(0) & ~still.all(0)):
@@ -232,7 +250,8 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[Lost]:
 
 def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
     """The spikes `found (T, J)` without which what hangs on their joints moves more smoothly, by fourth
-    differences.
+    differences. At an end a leap is in those once, while noise is in them sqrt(70) times: there second
+    differences tell.
 
     Joints fitted to keypoints twist to and fro, a forearm back as far as its upper arm: no hand leaps.
     """
@@ -246,14 +265,17 @@ def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
     for j in range(len(skeleton) - 1, 0, -1):
         hang[skeleton.parents[j]] |= hang[j]
     np.fill_diagonal(hang, False)
-    before = _rough(clip)
+    before, last = clip.positions(), clip.frames - 1
+    rough = [_rough(before, n) for n in (4, 2)]
     while spikes:
-        after = _rough(clip.replaced(rot=_filled(rot, spikes, clip.fps)))
+        after = clip.replaced(rot=_filled(rot, spikes, clip.fps)).positions()
+        both = [(was, _rough(after, n)) for was, n in zip(rough, (4, 2), strict=True)]
         kept = []
         for one in spikes:
             _, j, a, b = one
-            near = slice(max(a - 4, 0), b + 1)
-            there = [x[near, hang[j]].max(initial=0.0) for x in (before, after)]
+            end = a <= 2 or b >= last - 2
+            near = slice(max(a - (2 if end else 4), 0), b + 1)
+            there = [x[near, hang[j]].max(initial=0.0) for x in both[int(end)]]
             kept += [one] if there[1] <= CALMER * there[0] else []
         if len(kept) == len(spikes):
             break
@@ -261,9 +283,9 @@ def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
     return spikes
 
 
-def _rough(clip: Clip) -> np.ndarray:
-    """`(T - 4, J)` m, fourth differences of the joints' places."""
-    return np.linalg.norm(np.diff(clip.positions(), n=4, axis=0), axis=-1)
+def _rough(places: np.ndarray, n: int) -> np.ndarray:
+    """`(T - n, J)` m, differences of an order of joints' places `(T, J, 3)`."""
+    return np.linalg.norm(np.diff(places, n=n, axis=0), axis=-1)
 
 
 def _continuous(rot: np.ndarray) -> np.ndarray:
@@ -277,7 +299,7 @@ def _continuous(rot: np.ndarray) -> np.ndarray:
     return out
 
 
-def _small_spikes(rot: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
+def _small_spikes(rot: np.ndarray, known: np.ndarray, fps: float, least: float) -> np.ndarray:
     """`(T, J)` bool, spikes of a frame that are too small to be sure of in a motion without larger ones.
 
     A frame that leaps alone by s leaves fourth differences s (1, -4, 6, -4, 1): it stands out of the
@@ -293,9 +315,7 @@ def _small_spikes(rot: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
         size = np.linalg.norm(rough, axis=-1)
         usual = median_filter(size, (reach, 1), mode="nearest")
         beside = np.stack([(rough[2:-2] * rough[2 + k : len(rough) - 2 + k]).sum(-1) for k in (-1, 1)])
-        tall = (size[2:-2] > np.maximum(SMALL_TIMES * usual[2:-2], 0.5 * SMALL_RAD)) & (beside < 0).all(
-            0
-        )
+        tall = (size[2:-2] > np.maximum(SMALL_TIMES * usual[2:-2], 0.5 * least)) & (beside < 0).all(0)
         peak = np.stack([size[2 + k : len(size) - 2 + k] for k in (-2, -1, 0, 1, 2)]).argmax(0) == 2
         fresh = np.zeros_like(found)
         fresh[2:-2] = tall & peak
@@ -304,19 +324,25 @@ def _small_spikes(rot: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
         found |= fresh
     for j in range(rot.shape[1]):
         for way in (1, -1):
-            found[::way, j][:2] |= _spikes_at_start(rot[::way, j], found[::way, j], fps)
+            found[::way, j][:3] |= _spikes_at_start(rot[::way, j], found[::way, j], fps, least)
     return found
 
 
-def _spikes_at_start(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
-    """`(2)` bool, which of the first two frames of `y (T, 4)` must leap for the rest to be smooth."""
-    seen = known.copy()
-    for leaps in ((False, False), (True, False), (False, True), (True, True)):
-        seen[:2] = known[:2] | np.array(leaps)
-        rough = np.linalg.norm(np.diff(filled(y, ~seen, fps), n=3, axis=0), axis=-1)
-        if rough[:3].max() <= max(SMALL_TIMES * np.median(rough[:60]), SMALL_RAD):
-            return np.array(leaps)
-    return np.zeros(2, dtype=bool)
+def _spikes_at_start(y: np.ndarray, known: np.ndarray, fps: float, least: float) -> np.ndarray:
+    """`(3)` bool, which of the first three frames of `y (T, 4)` must leap for the rest to be smooth: as
+    few as can be, those without which it is smoothest."""
+    for many in range(3):
+        tries = list[tuple[float, np.ndarray]]()
+        for leaps in combinations(range(3), many):
+            seen = known.copy()
+            seen[list(leaps)] = True
+            rough = np.linalg.norm(np.diff(filled(y, ~seen, fps), n=3, axis=0), axis=-1)
+            over = rough[:4].max() / max(SMALL_TIMES * np.median(rough[:60]), least)
+            tries.append((over, np.isin(np.arange(3), leaps)))
+        over, found = min(tries, key=lambda one: one[0])
+        if over <= 1.0:
+            return found
+    return np.zeros(3, dtype=bool)
 
 
 def _reach(skeleton: Skeleton) -> np.ndarray:
@@ -421,6 +447,11 @@ class CleanReport:
     def __bool__(self) -> bool:
         return bool(self.flips or self.speeds or self.left or self.kept or self.noise)
 
+    def then(self, later: CleanReport) -> CleanReport:
+        """The repairs of a clip that was repaired once more: both, and what is left after that."""
+        both = self.flips + later.flips, self.speeds + later.speeds
+        return CleanReport(*both, later.left, later.kept, self.noise + later.noise)
+
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
         out = self.noise_sentences()
@@ -499,16 +530,6 @@ def clean_clip(
     if any(f.kind == "tremble" for f in found):
         slowed = denoise(slowed)
     return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, tuple(found))
-
-
-def without_noise(clip: Clip) -> tuple[Clip, CleanReport]:
-    """The clip without its noise and with its lost joints filled in, and nothing else changed; as it is
-    where its source is raw."""
-    if clip.skeleton.source.raw:
-        return clip, CleanReport()
-    found, whole = noise_faults(clip)
-    calm = denoise(whole) if any(f.kind == "tremble" for f in found) else whole
-    return calm, CleanReport(noise=tuple(found))
 
 
 @dataclass(frozen=True)
