@@ -217,8 +217,12 @@ def validate(config: Any, where: str | None = None) -> None:
             if where is None:
                 where, called = type(config).__name__, getattr(config, "name", None)
                 where = f"{where} '{called}'" if isinstance(called, str) else where
-            code = "unknown-choice" if one.choices else "out-of-range"
-            raise PoiseError(f"{name} {what}", where, one.hint(value), code=code)
+            raise PoiseError(
+                f"{name} {what}",
+                where,
+                one.hint(value),
+                code="unknown-choice" if one.choices else "out-of-range",
+            )
 
 
 @dataclass(frozen=True)
