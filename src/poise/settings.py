@@ -15,8 +15,9 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -191,9 +192,32 @@ def from_toml(kind: type[T], path: Path, verb: str = "") -> T:
     return from_data(kind, data, path)
 
 
+def part(place: str, /, made: bool = True, **values: Any) -> Any:
+    """A field for settings of another module, which is imported when they are first needed: the settings
+    around them can be shown without torch or MuJoCo.
+
+    Args:
+        place: module and class, "poise.learn:PPOConfig".
+        made: by default there are such settings; else None.
+        values: of its settings, where they differ from its own defaults.
+    """
+    where = {"place": place}
+    if not made:
+        return field(default=None, metadata=where)
+    return field(default_factory=lambda: imported(place)(**values), metadata=where)
+
+
+def imported(place: str) -> Any:
+    """What stands in a module, "poise.learn:PPOConfig"."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
 @cache
 def _types(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+    own: dict[str, Field[Any]] = getattr(kind, "__dataclass_fields__", {})
+    places: list[str] = [f.metadata["place"] for f in own.values() if "place" in f.metadata]
+    return get_type_hints(kind, localns={p.partition(":")[2]: imported(p) for p in places} or None)
 
 
 def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:

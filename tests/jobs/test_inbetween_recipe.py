@@ -11,6 +11,7 @@ import pytest
 from poise.cli.main import main
 from poise.errors import PoiseError
 from poise.formats import read_clip, write_bvh
+from poise.jobs.inbetween.settings import small
 from poise.jobs.inbetween.training import (
     FRAMES,
     Inbetween,
@@ -18,7 +19,6 @@ from poise.jobs.inbetween.training import (
     library_bank,
     motion_files,
     prepare,
-    small,
     steps_in,
     train,
 )

@@ -12,11 +12,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.console import Answer, say
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
-from poise.cli.settings import SOURCES, class_of, given
+from poise.cli.settings import SOURCES, given
 from poise.cli.train_inbetween import Network
 from poise.cli.train_perpetual import BY_HAND, Primitives, goes_on, settings
 from poise.cli.training import Shown, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
+from poise.settings import imported
 
 RECIPES = tuple(SOURCES)
 
@@ -112,7 +113,7 @@ def blank() -> Options:
 def config_of(o: Options) -> Any:
     """The recipe's settings, as the command line states them; what belongs to another one is refused."""
     values = given(o.recipe_settings, o.network, o.primitives)
-    default = class_of(o.recipe)()
+    default = imported(SOURCES[o.recipe])()
     known = {f.name for f in fields(default)}
     own = {
         "inbetween": ("dropout",),
