@@ -184,7 +184,7 @@ def test_train_inbetween_says_what_it_needs(capsys: pytest.CaptureFixture[str], 
 def test_resuming_the_command_line(
     library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("poise.cli.train.class_of", lambda recipe: lambda: small(Inbetween()))
+    monkeypatch.setattr("poise.cli.train.imported", lambda place: lambda: small(Inbetween()))
     argv = ["train", "inbetween", "--library", str(library), "-o", str(tmp_path / "run")]
     argv += ["--iterations", "3", "--threads", "1", "--hold-out", "sad"]
     assert main(argv) == 0
