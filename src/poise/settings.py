@@ -16,8 +16,9 @@ import math
 import sys
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import cache, cached_property
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
@@ -297,7 +298,9 @@ class _Declared:
 def _declared(kind: type) -> tuple[tuple[_Declared, str, float, float], ...]:
     """What the fields of a dataclass declare, but for those that may be anything: each with its name and
     the limits of a plain number."""
-    hints = get_type_hints(kind, include_extras=True)
+    # Settings of other modules check themselves; they need not be imported for this.
+    others = {place.partition(":")[2]: object for place in _places(kind)}
+    hints = get_type_hints(kind, localns=others or None, include_extras=True)
     out: list[tuple[_Declared, str, float, float]] = []
     for f in fields(kind):
         hint = hints[f.name]
@@ -440,9 +443,38 @@ def from_toml(kind: type[T], path: Path, verb: str = "") -> T:
     return from_data(kind, data, path)
 
 
+def part(place: str, /, made: bool = True, **values: Any) -> Any:
+    """A field for settings of another module, which is imported when they are first needed: the settings
+    around them can be shown without torch or MuJoCo.
+
+    Args:
+        place: module and class, "poise.learn:PPOConfig".
+        made: by default there are such settings; else None.
+        values: of its settings, where they differ from its own defaults.
+    """
+    where = {"place": place}
+    if not made:
+        return field(default=None, metadata=where)
+    return field(default_factory=lambda: imported(place)(**values), metadata=where)
+
+
+def imported(place: str) -> Any:
+    """What stands in a module, "poise.learn:PPOConfig"."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
 @cache
 def _types(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+    return get_type_hints(
+        kind, localns={p.partition(":")[2]: imported(p) for p in _places(kind)} or None
+    )
+
+
+def _places(kind: type) -> list[str]:
+    """Where the settings of other modules in a dataclass stand, see `part`."""
+    own: dict[str, Field[Any]] = getattr(kind, "__dataclass_fields__", {})
+    return [f.metadata["place"] for f in own.values() if "place" in f.metadata]
 
 
 def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:

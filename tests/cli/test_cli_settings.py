@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+import subprocess
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import pytest
 from tiny_clips import deepmimic, put
 
+from poise import settings
 from poise.cli import imitate, train
 from poise.cli.main import main
 from poise.cli.parse import parse
-from poise.cli.settings import SOURCES, _fields_of, configured, dotted, stated
+from poise.cli.settings import SOURCES, configured, dotted, stated
 from poise.formats import read_clip
 from poise.jobs.endless.training import Endless
 from poise.jobs.inbetween.training import Inbetween
@@ -21,6 +24,7 @@ from poise.papers.compliant.training import Compliant
 from poise.plan import TrajOptConfig
 from poise.recipes import ResidualForce
 from poise.recipes.perpetual_settings import Perpetual
+from poise.settings import imported
 from refusals import refused
 
 KINDS: dict[str, Any] = {
@@ -40,16 +44,48 @@ def trains(*argv: str) -> Any:
     return train.config_of(parse(train.Options, [*argv, "-o", "o"], "poise train"))
 
 
-@pytest.mark.parametrize("recipe", SOURCES)
-def test_the_source_that_is_read_is_the_class_that_is_imported(recipe: str) -> None:
-    kind, plain = KINDS[recipe], KINDS[recipe]()
-    types, found = get_type_hints(kind), _fields_of(recipe)
-    # A kinematic policy has few settings beside those of its parts.
-    assert len(found) >= (4 if recipe == "endless" else 8)
-    for name, (read, default, _) in found.items():
-        assert default == getattr(plain, name), name
-        assert types[name] in (read, read | None), name
-    assert set(found) <= {f.name for f in fields(kind)}
+@pytest.mark.parametrize(
+    ("group", "recipe"),
+    [(imitate.Chosen, "residual-force"), (train.Network, "inbetween"), (train.Primitives, "perpetual")],
+)
+def test_options_are_those_of_the_class(group: type, recipe: str) -> None:
+    kind = KINDS[recipe]
+    assert imported(SOURCES[recipe]) is kind
+    types, plain = settings._types(kind), kind()
+    hints = get_type_hints(group, include_extras=True)
+    own = {name for name in hints if name in types} - {"noise", "style", "teacher"}
+    assert len(own) >= 2
+    for name in own:
+        option, told = hints[name].__origin__, hints[name].__metadata__[0]
+        if option is bool:
+            assert getattr(group(), name) is getattr(plain, name), name
+        else:
+            assert option in (types[name], types[name] | None), name
+            assert told.help_behavior_hint == f"(default: {getattr(plain, name)})"
+            assert getattr(group(), name) is None
+
+
+def test_options_need_neither_torch_nor_mujoco() -> None:
+    code = (
+        "import sys\n"
+        "from importlib import import_module\n"
+        "from poise.cli.main import VERBS\n"
+        "for verb in (*VERBS, 'play_compliant'):\n"
+        "    import_module(f'poise.cli.{verb}')\n"
+        "print({'torch', 'mujoco', 'numpy', 'scipy'} & {*sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_parts_are_made_when_they_are_needed() -> None:
+    @dataclass(frozen=True)
+    class Whole:
+        part_: Any = settings.part("poise.plan:TrajOptConfig", iterations=7)
+        none: Any = settings.part("poise.plan:TrajOptConfig", made=False)
+
+    assert Whole() == Whole(TrajOptConfig(iterations=7), None)
+    assert Whole().part_ is not Whole().part_
 
 
 def test_every_derived_option_has_a_help_text() -> None:

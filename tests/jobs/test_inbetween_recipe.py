@@ -10,6 +10,7 @@ import pytest
 
 from poise.cli.main import main
 from poise.formats import read_clip, write_bvh
+from poise.jobs.inbetween.settings import small
 from poise.jobs.inbetween.training import (
     FRAMES,
     Inbetween,
@@ -17,7 +18,6 @@ from poise.jobs.inbetween.training import (
     library_bank,
     motion_files,
     prepare,
-    small,
     steps_in,
     train,
 )
@@ -184,7 +184,7 @@ def test_train_inbetween_says_what_it_needs(capsys: pytest.CaptureFixture[str], 
 def test_resuming_the_command_line(
     library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("poise.cli.train.class_of", lambda recipe: lambda: small(Inbetween()))
+    monkeypatch.setattr("poise.cli.train.imported", lambda place: lambda: small(Inbetween()))
     argv = ["train", "inbetween", "--library", str(library), "-o", str(tmp_path / "run")]
     argv += ["--iterations", "3", "--threads", "1", "--hold-out", "sad"]
     assert main(argv) == 0

@@ -18,7 +18,8 @@ from poise.kinematics import without_noise
 from poise.learn import load_checkpoint, save_checkpoint
 from poise.motion import ClipLibrary
 from poise.recipes import RECIPE, ResidualForce, build
-from poise.recipes.residual_force import config_of, most_help, schedule, task
+from poise.recipes.residual_force import schedule, task
+from poise.recipes.residual_force_settings import config_of, most_help
 from poise.score import Nothing, run_episodes, start_frames
 from poise.sim.mjcf import write_mjcf
 from refusals import refused

@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
 from poise import __version__
 from poise.errors import PoiseError, printable
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
     from poise.score import ScoreCard
 
 
@@ -28,6 +27,8 @@ _PIPE_WIDTH = 120
 
 
 def _console(stream: Any, everywhere: bool = False) -> Console:
+    from rich.console import Console
+
     # Made anew for each use, so that a stream that was replaced (by a test, a notebook) is honoured.
     terminal = hasattr(stream, "isatty") and stream.isatty()
     return Console(
@@ -50,6 +51,13 @@ def rank() -> int:
     return int(os.environ["RANK"]) if launched() else 0
 
 
+def _text(text: str, style: str = "") -> Text:
+    # The help of `poise` alone does without rich, which takes as long as all else together.
+    from rich.text import Text
+
+    return Text(text, style=style)
+
+
 def out() -> Console:
     """The console of results."""
     return _console(sys.stdout)
@@ -62,12 +70,12 @@ def err() -> Console:
 
 def say(text: str, style: str = "") -> None:
     """One line of result; it is never wrapped, so that paths can be copied."""
-    out().print(Text(printable(text, "\n\t"), style=style), soft_wrap=True)
+    out().print(_text(printable(text, "\n\t"), style), soft_wrap=True)
 
 
 def tell(text: str, style: str = "") -> None:
     """One line beside the results, on stderr."""
-    err().print(Text(printable(text, "\n\t"), style=style), soft_wrap=True)
+    err().print(_text(printable(text, "\n\t"), style), soft_wrap=True)
 
 
 def error(sentence: str, everywhere: bool = False) -> None:
@@ -75,6 +83,8 @@ def error(sentence: str, everywhere: bool = False) -> None:
 
     everywhere: of several processes also those speak that are silent otherwise.
     """
+    from rich.text import Text
+
     line = printable(" ".join(sentence.split()))
     if rank():
         line = f"process {rank()}: {line}"
@@ -98,6 +108,9 @@ def notes(sentences: Sequence[str], limit: int = 12) -> None:
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> None:
     """A table: its first `left` columns are words, the others are figures."""
+    from rich.table import Table
+    from rich.text import Text
+
     if title:
         # As a line of its own, since rich would fold a title to the width of its table.
         say(title, "bold")
@@ -129,7 +142,7 @@ def print_card(card: ScoreCard) -> None:
 
 
 def _verdict(word: str) -> Text:
-    return Text(word, style=_STYLES.get(word, ""))
+    return _text(word, _STYLES.get(word, ""))
 
 
 #: Exit codes beside 0 (done) and 1 (a fault of Poise or of the machine).

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,30 +9,22 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.console import LOST, Answer, launched, notes, print_card, say, tell
+from poise.cli.console import LOST, Answer, launched, print_card, say, tell
 from poise.cli.options import Body, Chosen, Flag, InPlace, Reading, Training, places, printed
 from poise.cli.settings import given
 from poise.cli.track import follow
-from poise.cli.training import (
-    Job,
-    clock,
-    command_line,
-    first_delivery,
-    held_already,
-    left,
-    showing,
-    stopped,
-    working,
-)
+from poise.cli.training import Shown, beginning, clock, command_line, left, stopped, summary
 from poise.errors import PoiseError
-from poise.jobs.keep import claimed, may_deliver
+from poise.jobs.keep import may_deliver
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress
     from poise.jobs.track import TrackConfig, Tracked
     from poise.jobs.tracker import Tracker
+    from poise.learn import PolicyBundle, WarmStart
     from poise.motion import Clip
     from poise.recipes import ResidualForce
+    from poise.recipes.imitation import Imitation
 
 
 @dataclass(frozen=True)
@@ -121,146 +112,89 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.run_file import RUN_FILE
 
     out, motion = places(o.out)
-    # A run that is not resumed is refused by `Job`, with or without --force: training takes hours.
-    held = (out / "run" / RUN_FILE).exists()
+    run = out / "run"
+    # A run that is not resumed is refused by `Shown`, with or without --force: training takes hours.
+    held = (run / RUN_FILE).exists()
     may_deliver(out, motion, o.force or held, o.clip)
-    job = Job((o.clip,), out, out / "run", o.training, config, o.reading, again, o.in_place)
-    if not from_nothing(o, out / "run"):
-        answer = practise(job, o.going_on, motion, o.hold_feet)
-        if answer is not None:
-            return answer
-    from poise.learn.parallel import joined
-
-    with joined() as comm:
-        imitation = job.start(comm)
-        result = job.train(imitation, comm, first_delivery(imitation, out, motion, o.hold_feet))
-    if result.interrupted:
-        return stopped(job.run, again)
-    if comm.rank:
-        return Answer()
-    from poise.jobs.deliver import deliver
-    from poise.jobs.run_file import learning_curve
-    from poise.jobs.runs import evaluate, trained_policy
-
-    try:
-        with working("simulating every start frame"):
-            trained, device = trained_policy(job.run, imitation), o.training.device
-            evaluation = evaluate(imitation, *trained, device=device)
-            curve = learning_curve(job.run)
-            done = deliver(imitation, evaluation, out, curve, motion, o.hold_feet)
-    except KeyboardInterrupt:
-        return stopped(job.run, again, " in the evaluation")
-    print_card(done.card)
-    return Answer(done.card.to_dict(), {**done.paths, "run": job.run}, done.notes)
-
-
-def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> Answer | None:
-    """Tracks the clip, trains on it, simulates every start frame, writes the result.
-
-    Args:
-        policy: a file or a run; None for the policy that comes with Poise, if its joints fit the clip.
-        motion: the file of the motion, in place of one in the folder. hold: standing feet are held.
-
-    Returns:
-        None where the policy does not fit, and the clip is to be learned from nothing.
-    """
-    from poise.jobs.open import open_run
-    from poise.jobs.practice import Watching
-    from poise.jobs.practice import practise as practised
-    from poise.jobs.run_file import RUN_FILE, learning_curve
-    from poise.jobs.track import write
+    nothing, t = from_nothing(o, run), o.training
+    from poise.jobs.imitate import Job
     from poise.jobs.track.tracked import story
-    from poise.learn import Until
 
-    t, held = job.training, (job.run / RUN_FILE).exists()
-    if held and not t.resume:
-        raise held_already(job.out)
-    clip = job.reading.read(job.clips[0])
-    say(f"{clip.name}: {clip.seconds:.1f} s")
-    notes(clip.skeleton.source.notes)
-    with working("opening the policy"):
-        tracker = open_run(policy).tracker
-    try:
-        tracker = tracker.with_bones_of(clip)
-    except PoiseError as problem:
-        if policy is not None:
-            raise
-        tell(f"It is learned from nothing, since the policy does not fit: {problem.what}.")
-        return None
-    with claimed(job.out):
-        until, seed = Until(minutes=t.minutes, iterations=t.iterations), job.config.seed
-        with Shown() as shown:
-            first = First(job.out, motion, hold)
-            told = Watching(shown.follow, first, lambda s: tell(s, "yellow"), shown.iteration)
-            try:
-                made = practised(
-                    clip, tracker, job.run, until, seed, t.threads, t.device, told, True, job.in_place
-                )
-            except KeyboardInterrupt:
-                # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
-                return stopped(job.run, job.again)
-        if made.tracked is None:
-            return stopped(job.run, job.again)
-        tracked = made.tracked
-        done = write(tracked, job.out, motion, hold, learning_curve(job.run))
+    with Shown((o.clip,), o.reading, t, run, out) as shown:
+        told = shown.watching(
+            follow=lambda *how: tracks(shown, *how),
+            first=lambda first: first_result(first, out, motion, o.hold_feet),
+            unfit=unfit,
+            iteration=lambda p: practised(shown, p),
+            beginning=lambda task: beginning(first_delivery(task, out, motion, o.hold_feet)),
+        )
+        how = (t.threads, t.device, o.in_place, told, True)
+        try:
+            made = Job(shown.read, run, config, t.until(), *how).done(o.going_on, nothing)
+            if made is None:
+                return Answer()
+            with shown.doing("writing"):
+                done = made.deliver(out, motion, o.hold_feet)
+        except KeyboardInterrupt:
+            return stopped(run, again, shown.where)
     print_card(done.card)
-    became = story(tracked, hint=False)
-    for sentence in (*(tracked.doubts if became.failed else ()), became.sentence, *made.sentences):
+    answer = Answer(done.card.to_dict(), {**done.paths, "run": run}, done.notes)
+    if made.tracked is None:
+        return answer
+    became, doubts = story(made.tracked, hint=False), made.tracked.doubts
+    for sentence in (*(doubts if became.failed else ()), became.sentence, *made.sentences):
         say(sentence)
     if became.failed or done.card.help.force_mean_n:
-        say(again(job))
-    told = (*tracked.notes, *done.notes)
-    code, said = (LOST, tracked.doubts) if became.failed else (0, ())
-    return Answer(
-        done.card.to_dict(), {**done.paths, "run": job.run}, told, code, became.word, said=said
-    )
+        say(f"Go on with --resume and --minutes {2 * t.minutes:g}.")
+    answer.notes, answer.outcome = (*made.tracked.notes, *done.notes), became.word
+    if became.failed:
+        answer.exit_code, answer.said = LOST, doubts
+    return answer
 
 
-class First:
-    """Writes what is done before anything is learned, and says so. motion, hold: see `practise`."""
-
-    def __init__(self, out: Path, motion: Path | None, hold: bool):
-        self.out, self.motion, self.hold = out, motion, hold
-
-    def __call__(self, first: Tracked) -> None:
-        from poise.jobs.track import write
-        from poise.jobs.track.tracked import story
-
-        done = write(first, self.out, self.motion, self.hold)
-        tell(f"First result: {story(first, hint=False).sentence} See {done.paths['report']}")
+def tracks(shown: Shown, policy: Tracker, clip: Clip, config: TrackConfig) -> Tracked:
+    """Tracks, with bars of its own."""
+    shown.close()
+    return follow(policy, [clip], config, [])
 
 
-class Shown:
-    """What is shown while a motion is practised: one bar at a time."""
+def first_result(first: Tracked, out: Path, motion: Path | None, hold: bool) -> None:
+    """Writes what is done before anything is learned, and says so."""
+    from poise.jobs.track import write
+    from poise.jobs.track.tracked import story
 
-    def __init__(self) -> None:
-        self._shown = contextlib.ExitStack()
-        self._bar: Callable[[float, str], None] | None = None
-
-    def __enter__(self) -> Shown:
-        return self
-
-    def __exit__(self, *problem: object) -> None:
-        self._shown.close()
-
-    def follow(self, policy: Tracker, clip: Clip, config: TrackConfig) -> Tracked:
-        """Tracks, with bars of its own."""
-        self._shown.close()
-        self._bar = None
-        return follow(policy, [clip], config, [])
-
-    def iteration(self, p: Progress) -> None:
-        """Shows one of the training."""
-        if self._bar is None:
-            self._bar = self._shown.enter_context(showing("training"))
-        spent = f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)} at most"
-        aid = f", with help of at most {p.help_n:.0f} N" if p.help_n else ""
-        self._bar(p.share, f"{spent}  {p.stats.samples_per_s:,.0f} samples/s{aid}")
-        if p.results is not None:
-            share, off = 100 * p.results.tracked_share, p.results.error_mm
-            tell(f"{clock(p.stats.seconds)}  the policy tracks {share:.0f} %, {off:.0f} mm off{aid}")
+    done = write(first, out, motion, hold)
+    tell(f"First result: {story(first, hint=False).sentence} See {done.paths['report']}")
 
 
-def again(job: Job) -> str:
-    """What to do about a motion that was not learned in time."""
-    return f"Go on with --resume and --minutes {2 * job.training.minutes:g}."
+def first_delivery(
+    task: Imitation, out: Path, motion: Path | None, hold: bool
+) -> Callable[[PolicyBundle, WarmStart], None]:
+    """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
+
+    def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
+        from poise.jobs.deliver import deliver
+        from poise.jobs.runs import evaluate
+        from poise.jobs.warm_start import FIRST_STARTS
+
+        meta = {"seconds": start.seconds, "samples": start.samples}
+        evaluation = evaluate(task, policy, meta, most=FIRST_STARTS)
+        paths = deliver(task, evaluation, out, {}, motion, hold).paths
+        tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
+
+    return deliver_first
+
+
+def unfit(problem: PoiseError) -> None:
+    """Tells why the policy that comes with Poise does not begin."""
+    tell(f"It is learned from nothing, since the policy does not fit: {problem.what}.")
+
+
+def practised(shown: Shown, p: Progress) -> None:
+    """Shows an iteration of a training on one motion."""
+    spent = f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)} at most"
+    aid = f", with help of at most {p.help_n:.0f} N" if p.help_n else ""
+    shown.bar(p.share, f"{spent}  {p.stats.samples_per_s:,.0f} samples/s{aid}")
+    if p.results is not None:
+        share, off = 100 * p.results.tracked_share, p.results.error_mm
+        tell(f"{clock(p.stats.seconds)}  the policy tracks {share:.0f} %, {off:.0f} mm off{aid}")

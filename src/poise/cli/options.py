@@ -20,6 +20,7 @@ from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.body import BodyConfig
+    from poise.learn import Until
     from poise.motion import Clip
 
     Chosen: TypeAlias = Any
@@ -211,6 +212,12 @@ class Training:
     def by_clip(self) -> bool:
         """Whether the settings depend on the clip, see `base_of`."""
         return self.preset is not None and self.config is None and not self.print_config
+
+    def until(self) -> Until:
+        """When the training ends."""
+        from poise.learn import Until
+
+        return Until(minutes=self.minutes, iterations=self.iterations)
 
     def check(self, chosen: Any) -> None:
         """Refuses numbers that make no sense, before anything is read or made."""

@@ -1,52 +1,37 @@
 """The settings of a recipe as options: derived from its dataclass, so that defaults have one truth.
 
 What trains is put together in this order: the recipe's defaults, or --preset, or --config; then the
-options that are given; then --set. The recipe's source is read, not imported, since that takes seconds
-and `--help` shall not: a test holds both against each other.
+options that are given; then --set. Settings with options stand in modules that need neither torch nor
+MuJoCo, which take seconds to import.
 """
 
 from __future__ import annotations
 
-import ast
 import re
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_args
+from types import NoneType, SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-import poise
 from poise.errors import PoiseError
+from poise.settings import imported
 
 if TYPE_CHECKING:
     from poise.motion import Clip
 
 T = TypeVar("T")
-#: Where the dataclass of each recipe stands, below the package.
+#: The dataclass of each recipe's settings.
 SOURCES = {
-    "residual-force": ("recipes/residual_force.py", "ResidualForce"),
-    "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
-    "perpetual": ("recipes/perpetual_settings.py", "Perpetual"),
-    "endless": ("jobs/endless/training.py", "Endless"),
-    "compliant": ("papers/compliant/training.py", "Compliant"),
-}
-_TYPES = {"float": float, "int": int, "bool": bool, "str": str}
-#: Those with a range, in `poise.settings`.
-_TYPES |= {"Share": float, "Positive": float, "NotNegative": float, "Count": int, "Limit": float}
-#: Of fields that need no entry in a recipe.
-_UNSAID = {
-    "num_envs": "environments that are simulated at once.",
-    "seed": "seed of everything random.",
-    "net": "the network; rtn is that of Harvey et al. 2020.",
+    "residual-force": "poise.recipes.residual_force_settings:ResidualForce",
+    "inbetween": "poise.jobs.inbetween.settings:Inbetween",
+    "perpetual": "poise.recipes.perpetual_settings:Perpetual",
+    "endless": "poise.jobs.endless.training:Endless",
+    "compliant": "poise.papers.compliant.training:Compliant",
 }
 _METAVARS = {float: "X", int: "N", str: "TEXT"}
-
-
-def class_of(recipe: str) -> type:
-    """The dataclass of a recipe's settings, which takes seconds to import."""
-    file, name = SOURCES[recipe]
-    return getattr(import_module("poise." + file.removesuffix(".py").replace("/", ".")), name)
 
 
 def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
@@ -61,61 +46,40 @@ def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
     """
     from tyro.conf import arg
 
-    found = _fields_of(recipe)
-    made = []
+    kind = imported(SOURCES[recipe])
+    texts, made = _texts(kind), []
     for name in (*names, *flags):
-        kind, default, text = found[name]
+        type_, default, text = _plain_type(kind, name), getattr(kind, name), texts[name]
         hint = "" if default is None else f"(default: {default})"
         how: dict[str, Any] = {"name": flags.get(name), "help_behavior_hint": hint}
-        if kind is bool:
+        if type_ is bool:
             off = "" if not default or text.startswith("off,") else "switch off: "
             how |= {"help": _upper(prefix + off + text), "help_behavior_hint": ""}
-            made.append((name, Annotated[bool, arg(**how)], field(default=bool(default))))
+            made.append((name, Annotated[bool, arg(**how)], field(default=default)))
             continue
-        values = [str(v) for v in get_args(kind)]
-        how |= {"help": _upper(prefix + text), "metavar": "|".join(values) or _METAVARS[kind]}
-        made.append((name, Annotated[kind | None, arg(**how)], field(default=None)))
-    return make_dataclass(f"Settings{SOURCES[recipe][1]}", made, frozen=True)
+        values = [str(v) for v in get_args(type_)]
+        how |= {"help": _upper(prefix + text), "metavar": "|".join(values) or _METAVARS[type_]}
+        made.append((name, Annotated[type_ | None, arg(**how)], field(default=None)))
+    return make_dataclass(f"Settings{kind.__name__}", made, frozen=True)
 
 
 def _upper(text: str) -> str:
     return text if re.match(r"\w+: ", text) else text[:1].upper() + text[1:]
 
 
-def _fields_of(recipe: str) -> dict[str, tuple[Any, Any, str]]:
-    """Type, default and help text of each field of plain values."""
-    file, name = SOURCES[recipe]
-    tree = ast.parse((Path(poise.__file__).parent / file).read_text("utf-8"))
-    known: dict[str, Any] = dict(_TYPES)
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and (alias := _type_of(node.value, known)) is not None:
-            known[ast.unparse(node.targets[0])] = alias
-    kind = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name)
-    rows = {str(ast.unparse(n.target)): n for n in kind.body if isinstance(n, ast.AnnAssign)}
-    texts = _texts(ast.get_docstring(kind) or "", tuple(rows))
-    out: dict[str, tuple[Any, Any, str]] = {}
-    for row, node in rows.items():
-        read = _type_of(node.annotation, known)
-        if isinstance(node.value, ast.Constant) and read is not None:
-            out[row] = read, node.value.value, texts.get(row) or _UNSAID.get(row, "")
-    return out
+def _plain_type(kind: type, name: str) -> Any:
+    """The type of a setting without its None; those of other settings may need torch."""
+    one = SimpleNamespace(__annotations__={name: kind.__annotations__[name]})
+    found = get_type_hints(one, vars(sys.modules[kind.__module__]))[name]
+    others = [a for a in get_args(found) if a is not NoneType]
+    return found if get_origin(found) is Literal or not others else others[0]
 
 
-def _type_of(node: ast.expr, known: Mapping[str, Any]) -> Any:
-    """The plain type that an annotation names, without its None; None for any other."""
-    if isinstance(node, ast.BinOp):
-        return _type_of(node.left, known)
-    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Annotated":
-        return _type_of(cast("ast.Tuple", node.slice).elts[0], known)
-    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
-        return Literal[ast.literal_eval(node.slice)]
-    return known.get(node.id) if isinstance(node, ast.Name) else None
-
-
-def _texts(doc: str, names: tuple[str, ...]) -> dict[str, str]:
+def _texts(kind: type) -> dict[str, str]:
     """Each entry `name: text` of a docstring, on one line or of several."""
-    flat = " ".join(doc.split())
-    parts = re.split(rf"(?:(?<=[.:] )|^)((?:{'|'.join(names)})(?:, (?:{'|'.join(names)}))*): ", flat)
+    names = "|".join(f.name for f in fields(kind))
+    flat = " ".join((kind.__doc__ or "").split())
+    parts = re.split(rf"(?:(?<=[.:] )|^)((?:{names})(?:, (?:{names}))*): ", flat)
     out: dict[str, str] = {}
     for listed, text in zip(parts[1::2], parts[2::2], strict=True):
         out |= dict.fromkeys(listed.split(", "), text.replace("`", "").strip())

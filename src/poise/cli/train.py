@@ -12,11 +12,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.console import Answer, say
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
-from poise.cli.settings import SOURCES, class_of, given
+from poise.cli.settings import SOURCES, given
 from poise.cli.train_inbetween import Network
 from poise.cli.train_perpetual import BY_HAND, Primitives, goes_on, settings
-from poise.cli.training import Job, command_line, stopped
+from poise.cli.training import Shown, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
+from poise.settings import imported
 
 RECIPES = tuple(SOURCES)
 
@@ -90,14 +91,14 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             hint=f"Write poise train {o.recipe} CLIP -o RUNDIR",
             code="argument-missing",
         )
-    job = Job(o.clips, o.out, o.out, o.training, config, o.reading, again)
-    from poise.learn.parallel import joined
+    from poise.jobs.imitate import Job
 
-    with joined() as comm:
-        imitation = job.start(comm)
-        result = job.train(imitation, comm)
+    t = o.training
+    with Shown(o.clips, o.reading, t, o.out, o.out) as shown:
+        how = (t.threads, t.device, "auto", shown.watching(), True)
+        result = Job(shown.read, o.out, config, t.until(), *how).learned()[1]
     if result.interrupted:
-        return stopped(job.run, again)
+        return stopped(o.out, again)
     if result.last is None:
         say(f"{o.out} had reached its limit before; nothing was trained.")
     else:
@@ -118,7 +119,7 @@ def blank() -> Options:
 def config_of(o: Options) -> Any:
     """The recipe's settings, as the command line states them; what belongs to another one is refused."""
     values = given(o.recipe_settings, o.network, o.primitives)
-    default = class_of(o.recipe)()
+    default = imported(SOURCES[o.recipe])()
     known = {f.name for f in fields(default)}
     own = {
         "inbetween": ("dropout",),

@@ -15,10 +15,11 @@ from poise.cli import training as progress
 from poise.cli.console import Answer, launched, notes, say, table, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Flag, Training
-from poise.cli.settings import class_of, configured, derived, given, stated
+from poise.cli.settings import SOURCES, configured, derived, given, stated
 from poise.cli.training import beginning, clock, held_already, left, showing, stopped
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
+from poise.settings import imported
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.run import PerpetualResult
@@ -239,7 +240,7 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     names = [name for name in given(primitives, replace(body, set=())) if name not in free]
     names += [name for name in ("preset", "config") if getattr(o.training, name)]
     names += ["help_start"] if o.recipe_settings.help_start else []
-    more, of_the_body = stated(body.set, class_of("perpetual"))
+    more, of_the_body = stated(body.set, imported(SOURCES["perpetual"]))
     names += [text.partition("=")[0] for text in of_the_body]
     # A part that is kept, one of its settings, or a part with a setting that is kept.
     kept = [f"{name}." for name in KEPT]

@@ -8,25 +8,22 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from poise.cli.console import INTERRUPTED, Answer, err, launched, notes, say, tell
-from poise.cli.options import InPlace, Reading, Training
+from poise.cli.options import Reading, Training
 from poise.errors import PoiseError
-from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
+    from poise.jobs.practice import Watching
     from poise.jobs.warm_start import TrainingCallbacks
-    from poise.learn import CloneStats, IterationStats, PolicyBundle, RunResult, Until, WarmStart
-    from poise.learn.parallel import Comm
-    from poise.motion import ClipLibrary
+    from poise.learn import CloneStats, IterationStats, PolicyBundle, Until, WarmStart
+    from poise.motion import Clip, ClipLibrary
     from poise.plan import TrajOptStats
-    from poise.recipes import ResidualForce
     from poise.recipes.imitation import Imitation
     from poise.score import ScoreCard
 
@@ -134,87 +131,6 @@ def staged(shown: contextlib.ExitStack) -> Callable[[str, int, int], None]:
     return show
 
 
-@dataclass(frozen=True)
-class Job:
-    """One training: which clips, into which result folder and run folder, how."""
-
-    clips: tuple[Path, ...]
-    out: Path
-    run: Path
-    training: Training
-    config: ResidualForce
-    reading: Reading
-    again: str
-    """The command line that goes on with it."""
-    in_place: InPlace = "auto"
-
-    def start(self, comm: Comm) -> Imitation:
-        """The task on every process: rank 0 begins the run, the others open its folder."""
-        from poise.jobs.open import open_run
-        from poise.learn.parallel import share_of, together
-
-        with together(comm):
-            if comm.size > 1:
-                share_of(self.config.num_envs, comm)
-            imitation = self.begin() if comm.rank == 0 else None
-        with together(comm):
-            return imitation or open_run(self.run).task
-
-    def begin(self) -> Imitation:
-        """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""
-        from poise.jobs.run_file import RUN_FILE
-        from poise.jobs.runs import begin
-
-        held = (self.run / RUN_FILE).exists()
-        if held and not self.training.resume:
-            raise held_already(self.out)
-        library = self.read()
-        say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
-        notes([n for clip in library for n in clip.skeleton.source.notes])
-        with claimed(self.out), claimed(self.run), working("making the body"):
-            imitation = begin(self.run, library, self.config, self.training.device)
-        if self.training.resume and not held:
-            tell(f"There was no run in {self.run}; a new one starts.")
-        notes(imitation.report.sentences())
-        return imitation
-
-    def read(self) -> ClipLibrary:
-        """All clips, each with a name of its own."""
-        from poise.jobs.track.rates import with_travel
-        from poise.motion import ClipLibrary
-
-        seen: dict[str, int] = {}
-        clips = []
-        for path in self.clips:
-            clip = self.reading.read(path)
-            if (travel := with_travel(clip, self.in_place, repeats=False, returns=False)) is not None:
-                tell(travel.sentence(), "yellow")
-                clip = travel.clip
-            seen[clip.name] = seen.get(clip.name, 0) + 1
-            count = seen[clip.name]
-            clips.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
-        return ClipLibrary(tuple(clips))
-
-    def train(self, imitation: Imitation, comm: Comm, first: First | None = None) -> RunResult:
-        """Trains until the limit or Ctrl-C; either way everything is saved. `first` gets the clone."""
-        from poise.jobs.runs import train
-        from poise.learn import RunResult, Until
-
-        until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
-        if self.training.device != "cpu":
-            tell("The first steps on a new GPU compile its kernels, which takes minutes once.", "dim")
-        try:
-            with training(until) as show:
-                t, begins = self.training, beginning(first)
-                return train(
-                    imitation, self.run, until, show, t.threads,
-                    comm=comm, beginning=begins, device=t.device,
-                )  # fmt: skip
-        except KeyboardInterrupt:
-            # A second Ctrl-C ends the present iteration too; all before it are saved.
-            return RunResult(None, True, None)
-
-
 def held_already(out: Path) -> PoiseError:
     """What is said of a run that is there and was not asked to go on."""
     return PoiseError(
@@ -277,10 +193,9 @@ def command_line(verb: str, argv: Sequence[str]) -> str:
     return shlex.join((*program, verb, *argv, *more))
 
 
-First = Callable[["PolicyBundle", "WarmStart"], None]
-
-
-def beginning(first: First | None = None) -> TrainingCallbacks:
+def beginning(
+    first: Callable[[PolicyBundle, WarmStart], None] | None = None,
+) -> TrainingCallbacks:
     """Callbacks that tell the steps before PPO begins; `first` gets the clone."""
     from poise.jobs.warm_start import TrainingCallbacks
 
@@ -301,22 +216,88 @@ def beginning(first: First | None = None) -> TrainingCallbacks:
     return TrainingCallbacks(expert, cloned_round, first, failed, path)
 
 
-def first_delivery(
-    imitation: Imitation, out: Path, motion: Path | None = None, hold: bool = True
-) -> First:
-    """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
+class Shown:
+    """What is shown while a motion is learned, one bar at a time: see `jobs.practice.Watching`.
 
-    def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
-        from poise.jobs.deliver import deliver
-        from poise.jobs.runs import evaluate
-        from poise.jobs.warm_start import FIRST_STARTS
+    clips: the files that are read. out: the folder that is named where `run` is there already.
+    """
 
-        meta = {"seconds": start.seconds, "samples": start.samples}
-        evaluation = evaluate(imitation, policy, meta, most=FIRST_STARTS)
-        paths = deliver(imitation, evaluation, out, {}, motion, hold).paths
-        tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
+    def __init__(
+        self, clips: Sequence[Path], reading: Reading, training: Training, run: Path, out: Path
+    ):
+        self._clips, self._reading, self._training = clips, reading, training
+        self._run, self._out = run, out
+        self._bar: Callable[[float, str], None] | None = None
+        self._shown = contextlib.ExitStack()
+        self._held, self.where = False, ""
 
-    return deliver_first
+    def __enter__(self) -> Shown:
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self._shown.close()
+
+    def read(self) -> list[Clip]:
+        """The clips, unless the folder holds a run that is not to go on."""
+        from poise.jobs.run_file import RUN_FILE
+
+        self._held = (self._run / RUN_FILE).exists()
+        if self._held and not self._training.resume:
+            raise held_already(self._out)
+        return [self._reading.read(path) for path in self._clips]
+
+    def given(self, library: ClipLibrary) -> None:
+        """Says what was read."""
+        say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
+        notes([n for clip in library for n in clip.skeleton.source.notes])
+
+    @contextlib.contextmanager
+    def doing(self, what: str) -> Iterator[None]:
+        """What takes seconds."""
+        self.close()
+        from poise.jobs.practice import EVALUATING
+
+        if what == EVALUATING:
+            self.where = " in the evaluation"
+        with working(what):
+            yield
+
+    def close(self) -> None:
+        """Ends the bar."""
+        self._shown.close()
+        self._bar = None
+
+    def begun(self, task: Imitation) -> None:
+        """Says what the body came to."""
+        if self._training.resume and not self._held:
+            tell(f"There was no run in {self._run}; a new one starts.")
+        notes(task.report.sentences())
+        if self._training.device != "cpu":
+            tell("The first steps on a new GPU compile its kernels, which takes minutes once.", "dim")
+
+    def stats(self, stats: IterationStats) -> None:
+        """Shows an iteration of a training from nothing."""
+        until = self._training.until()
+        self.bar(share_done(stats, until), f"{times(stats, until)}  {figures(stats)}")
+
+    def bar(self, share: float, text: str) -> None:
+        """Shows how much of the training is done."""
+        if self._bar is None:
+            self._bar = self._shown.enter_context(showing("training"))
+        self._bar(share, text)
+
+    def say(self, sentence: str) -> None:
+        """Tells a sentence."""
+        tell(sentence, "yellow")
+
+    def watching(self, **more: Any) -> Watching:
+        """The callbacks of a job."""
+        from poise.jobs.practice import Watching
+
+        own: dict[str, Any] = {
+            name: getattr(self, name) for name in ("say", "doing", "given", "begun", "stats")
+        }
+        return Watching(**{"beginning": lambda _: beginning(), **own, **more})
 
 
 def summary(card: ScoreCard) -> str:

@@ -10,17 +10,19 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from poise.errors import PoiseError
 from poise.jobs.deliver import Delivery, deliver, finished
+from poise.jobs.keep import claimed
 from poise.jobs.open import Run, open_run
-from poise.jobs.perpetual.stage_order import Progress
-from poise.jobs.practice import Watching, practise
+from poise.jobs.practice import EVALUATING, Watching, practise
 from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
@@ -29,7 +31,8 @@ from poise.jobs.track.rates import with_travel
 from poise.jobs.track.settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
-from poise.learn import IterationStats, PolicyBundle, Until
+from poise.learn import IterationStats, PolicyBundle, RunResult, Until
+from poise.learn.parallel import ALONE, Comm, joined, share_of, together
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
@@ -101,15 +104,21 @@ class Imitated(Result):
         return Shown(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
-        curve = learning_curve(self.run)
-        if self.tracked is not None:
-            paths = write(self.tracked, folder, curve=curve).paths
-        else:
-            paths = deliver(self.task, self.evaluation, folder, curve).paths
+        paths = self.deliver(folder).paths
         kept = folder / RUN
         if kept.resolve() != self.run.resolve():
             shutil.copytree(self.run, kept, dirs_exist_ok=True)
         return paths | {"run": kept}
+
+    def deliver(self, folder: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
+        """Writes motion, score and report into `folder`, see `deliver.deliver`.
+
+        motion: the file of the motion, in place of one in `folder`. hold: standing feet are held.
+        """
+        curve = learning_curve(self.run)
+        if self.tracked is not None:
+            return write(self.tracked, folder, motion, hold, curve)
+        return deliver(self.task, self.evaluation, folder, curve, motion, hold)
 
 
 def imitate(
@@ -165,24 +174,23 @@ def imitate(
             code="settings-conflict",
         )
     config = changed(config or ResidualForce(), settings)
-    library = ClipLibrary.of([clip_of(c) for c in several])
     run = Path(tempfile.mkdtemp(prefix="poise-")) if folder is None else Path(folder) / RUN
+    told = Watching(
+        iteration=lambda p: None if on_iteration is None else on_iteration(p.stats),
+        beginning=lambda _: callbacks,
+        stats=on_iteration,
+    )
+    job = Job(lambda: [clip_of(c) for c in several], run, config, until, threads, device, in_place, told)
     try:
-        tracker = None if stated or len(several) > 1 else _tracker(policy, library.clips[0])
-        if tracker is not None:
-            how = (run, until, config.seed, threads, device, on_iteration, in_place)
-            return _kept(_practised(library.clips[0], tracker, *how), folder)
-        travels = [with_travel(c, in_place, repeats=False, returns=False) for c in library]
-        moving = [c if t is None else t.clip for c, t in zip(library, travels, strict=True)]
-        task = begin(run, ClipLibrary.of(moving), config, device)
-        done = train(task, run, until, on_iteration, threads, False, beginning=callbacks, device=device)
-        learned, meta = trained_policy(run, task)
-        scored = evaluate(task, learned, meta, device=device)
-        return _kept(Imitated(task, learned, scored, run, done.interrupted), folder)
+        made = job.done(policy, bool(stated) or len(several) > 1)
     except BaseException:
         if folder is None:
             shutil.rmtree(run, ignore_errors=True)
         raise
+    assert made is not None
+    if folder is None:
+        weakref.finalize(made, shutil.rmtree, made.run, True)
+    return made
 
 
 def _limit(minutes: float, iterations: int | None) -> Until:
@@ -196,46 +204,114 @@ def _limit(minutes: float, iterations: int | None) -> Until:
     return Until(minutes=minutes if minutes > 0 else None, iterations=iterations)
 
 
-def _tracker(policy: Tracker | Run | str | Path | None, clip: Clip) -> Tracker | None:
-    """The policy with the bones of the clip; None where that which comes with Poise does not fit."""
-    run = open_run(policy) if policy is None or isinstance(policy, str | Path) else policy
-    tracker = run.tracker if isinstance(run, Run) else run
-    try:
-        return tracker.with_bones_of(clip)
-    except PoiseError:
-        if policy is None:
+@dataclass(frozen=True)
+class Job:
+    """What `imitate` does, for Python and the command line.
+
+    Attributes:
+        read: gives the clips, a single one where a policy begins.
+        run: the run folder.
+        config, until, threads, device, in_place, told: see `imitate` and `Watching`.
+        attended: by a user at a terminal: processes of `torchrun` train together, what Ctrl-C ended is
+            not evaluated, and the curve is kept for TensorBoard as well.
+    """
+
+    read: Callable[[], Sequence[Clip]]
+    run: Path
+    config: ResidualForce
+    until: Until
+    threads: int = 0
+    device: str = "cpu"
+    in_place: Mode = "auto"
+    told: Watching = field(default_factory=Watching)
+    attended: bool = False
+
+    def done(
+        self, policy: Tracker | Run | str | Path | None = None, nothing: bool = False
+    ) -> Imitated | None:
+        """What came of the clips; None on every process of `torchrun` but the first.
+
+        nothing: no policy begins.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C ended the training, `attended`; what came of it is saved.
+            PoiseError: see `imitate`.
+        """
+        made = None if nothing else self._practised(policy)
+        if made is not None:
+            return made
+        task, result, rank = self.learned()
+        if result.interrupted and self.attended:
+            raise KeyboardInterrupt
+        if rank:
             return None
-        raise
+        with self.told.doing(EVALUATING):
+            net, meta = trained_policy(self.run, task)
+            evaluation = evaluate(task, net, meta, device=self.device)
+        return Imitated(task, net, evaluation, self.run, result.interrupted)
 
+    def _practised(self, policy: Tracker | Run | str | Path | None) -> Imitated | None:
+        """What a policy makes of the clip; None where that which comes with Poise does not fit."""
+        (clip,) = self.read()
+        self.told.given(ClipLibrary.of(clip))
+        with self.told.doing("opening the policy"):
+            run = open_run(policy) if policy is None or isinstance(policy, str | Path) else policy
+            tracker = run.tracker if isinstance(run, Run) else run
+        try:
+            tracker = tracker.with_bones_of(clip)
+        except PoiseError as problem:
+            if policy is not None:
+                raise
+            self.told.unfit(problem)
+            return None
+        with claimed(self.run.parent):
+            made = practise(
+                clip, tracker, self.run, self.until, self.config.seed, self.threads, self.device,
+                self.told, self.attended, self.in_place,
+            )  # fmt: skip
+        if made.tracked is None:
+            raise KeyboardInterrupt
+        t, own, result = made.tracked, made.learned.tracker.policy, made.learned.result
+        return Imitated(t.imitation, own, t.evaluation, self.run, result.interrupted, t, made.sentences)
 
-def _practised(
-    clip: Clip,
-    tracker: Tracker,
-    run: Path,
-    until: Until,
-    seed: int,
-    threads: int,
-    device: str,
-    on_iteration: Callable[[IterationStats], bool | None] | None,
-    in_place: Mode,
-) -> Imitated:
-    """What came of a policy that learned a motion on its own joints with the bones of the clip."""
+    def learned(self) -> tuple[Imitation, RunResult, int]:
+        """The clips learned from nothing: the task, how its training ended, this process's rank."""
+        with joined() if self.attended else nullcontext(ALONE) as comm:
+            task = self._begun(comm)
+            more = (self.attended, comm, self.told.beginning(task), self.device)
+            try:
+                result = train(task, self.run, self.until, self.told.stats, self.threads, *more)
+            except KeyboardInterrupt:
+                # A second Ctrl-C ends the present iteration too; all before it are saved.
+                if not self.attended:
+                    raise
+                result = RunResult(None, True, None)
+        return task, result, comm.rank
 
-    def tell(p: Progress) -> bool | None:
-        return None if on_iteration is None else on_iteration(p.stats)
+    def _begun(self, comm: Comm) -> Imitation:
+        """The task on every process: the first one begins the run, the others open its folder."""
+        task = None
+        with together(comm):
+            if comm.size > 1:
+                share_of(self.config.num_envs, comm)
+            if comm.rank == 0:
+                library = self._travelling()
+                self.told.given(library)
+                with self.told.doing("making the body"), claimed(self.run):
+                    task = begin(self.run, library, self.config, self.device)
+                self.told.begun(task)
+        with together(comm):
+            return task or open_run(self.run).task
 
-    made = practise(
-        clip, tracker, run, until, seed, threads, device, Watching(iteration=tell), False, in_place
-    )
-    done, learned = made.tracked, made.learned
-    assert done is not None
-    task, evaluation = done.imitation, done.evaluation
-    interrupted = learned.result.interrupted
-    return Imitated(task, learned.tracker.policy, evaluation, run, interrupted, done, made.sentences)
-
-
-def _kept(made: Imitated, folder: str | Path | None) -> Imitated:
-    """The same; a run without a folder is deleted with its result."""
-    if folder is None:
-        weakref.finalize(made, shutil.rmtree, made.run, True)
-    return made
+    def _travelling(self) -> ClipLibrary:
+        """The clips, each with a name of its own, and those in place with the travel of their feet."""
+        counts, out = Counter[str](), list[Clip]()
+        for clip in self.read():
+            travel = with_travel(clip, self.in_place, repeats=False, returns=False)
+            if travel is not None:
+                self.told.say(travel.sentence())
+                clip = travel.clip
+            counts[clip.name] += 1
+            count = counts[clip.name]
+            out.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
+        return ClipLibrary(tuple(out))

@@ -39,7 +39,8 @@ from poise.recipes.perpetual import RECIPE as PERPETUAL
 from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.perpetual_settings import config_of as perpetual_config
 from poise.recipes.residual_force import RECIPE as RESIDUAL_FORCE
-from poise.recipes.residual_force import build, config_of
+from poise.recipes.residual_force import build
+from poise.recipes.residual_force_settings import config_of
 from poise.settings import check_data, from_data
 from poise.version import __version__
 

@@ -16,10 +16,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from poise.errors import PoiseError
 from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.run_file import RUN_FILE
 from poise.jobs.track import TrackConfig, Tracked, track
@@ -38,30 +40,46 @@ from poise.jobs.track.placement import place
 from poise.jobs.track.rates import InPlace, with_travel
 from poise.jobs.track.settings import Mode
 from poise.jobs.tracker import Tracker
-from poise.learn import Until
-from poise.motion import Clip
+from poise.jobs.warm_start import TrainingCallbacks
+from poise.learn import IterationStats, Until
+from poise.motion import Clip, ClipLibrary
+from poise.recipes.imitation import Imitation
 
 #: Start frames from which a motion is to be done before its training ends.
 STARTS = 32
+#: What `Watching.doing` is told last.
+EVALUATING = "simulating every start frame"
 #: The share of the minutes that training has at least, whatever looking for the motion takes.
 LEAST = 0.5
 
 
 @dataclass(frozen=True)
 class Watching:
-    """What is told while a motion is practised.
+    """Callbacks for what happens while a motion is imitated.
 
     Attributes:
         follow: tracks a motion, see `track`.
         first: is told of what was done before anything is learned.
         say: sentences, as they become known.
-        iteration: each of the training; False ends it.
+        iteration: each of the training on a motion; False ends it.
+        doing: names what takes seconds, and surrounds it.
+        given: the clips, once they are read.
+        unfit: why the policy that comes with Poise does not fit, so that nothing begins.
+        begun: the body, where it is learned from nothing.
+        beginning: callbacks for what happens there before PPO begins.
+        stats: each iteration there; False ends the training.
     """
 
     follow: Callable[[Tracker, Clip, TrackConfig], Tracked] = lambda t, c, how: track(c, t, how)
     first: Callable[[Tracked], None] = lambda _: None
     say: Callable[[str], None] = lambda _: None
     iteration: Callable[[Progress], bool | None] = lambda _: None
+    doing: Callable[[str], AbstractContextManager[Any]] = lambda _: nullcontext()
+    given: Callable[[ClipLibrary], None] = lambda _: None
+    unfit: Callable[[PoiseError], None] = lambda _: None
+    begun: Callable[[Imitation], None] = lambda _: None
+    beginning: Callable[[Imitation], TrainingCallbacks | None] = lambda _: None
+    stats: Callable[[IterationStats], bool | None] | None = None
 
 
 class Practised(NamedTuple):

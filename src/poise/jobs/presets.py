@@ -7,10 +7,10 @@ from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.endless.training import Endless
-from poise.jobs.inbetween.training import Inbetween, small
+from poise.jobs.inbetween.settings import Inbetween, small
 from poise.motion import Clip
 from poise.recipes.perpetual_settings import Perpetual
-from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force_settings import ResidualForce
 
 #: The names of presets.
 NAMES = ("paper", "code", "fast")

@@ -34,7 +34,8 @@ from poise.learn.checkpoint import only_writer
 from poise.learn.parallel import ALONE, Comm, together
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
+from poise.recipes.residual_force import RECIPE, build
+from poise.recipes.residual_force_settings import ResidualForce, config_of, most_help
 from poise.score import (
     TRACKING,
     Nothing,

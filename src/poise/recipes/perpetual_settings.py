@@ -6,20 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.learn import (
-    AmpConfig,
-    CloneConfig,
-    ConvergenceConfig,
-    LessonConfig,
-    MiningConfig,
-    PPOConfig,
-)
-from poise.plan import TeacherConfig, TrajOptConfig
-from poise.recipes.shapes import BodyShapes
 from poise.settings import (
     Checked,
     Count,
@@ -30,9 +19,23 @@ from poise.settings import (
     Range,
     Share,
     from_data,
+    part,
     validate,
 )
-from poise.sim import SimConfig
+
+if TYPE_CHECKING:
+    from poise.body import BodyConfig
+    from poise.learn import (
+        AmpConfig,
+        CloneConfig,
+        ConvergenceConfig,
+        LessonConfig,
+        MiningConfig,
+        PPOConfig,
+    )
+    from poise.plan import TeacherConfig, TrajOptConfig
+    from poise.recipes.shapes import BodyShapes
+    from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped, so that lying is told from leaning.
 WIDE = 30.0
@@ -99,6 +102,8 @@ class Perpetual:
     """Settings of one run.
 
     Attributes:
+        num_envs: environments that are simulated at once.
+        seed: seed of everything random.
         goal: what is told of the next frame, "rotations" and places or "keypoints", which are places
             alone.
         shape: limb lengths and masses are observed, too.
@@ -169,7 +174,7 @@ class Perpetual:
 
     goal: Literal["rotations", "keypoints"] = "rotations"
     shape: bool = False
-    shapes: BodyShapes = field(default_factory=BodyShapes)
+    shapes: BodyShapes = part("poise.recipes.shapes:BodyShapes")
     heading: Literal["hips", "twist"] = "hips"
     window: Annotated[tuple[int, ...], Range(2, unit="control steps")] = ()
     filter: Annotated[float, Range(0, 1, below=True)] = 0.0
@@ -184,7 +189,7 @@ class Perpetual:
     foot_slide: NotNegative = 0.0
     noise: Annotated[tuple[float, ...], Range(0, 100, above=True, below=True)] = ()
     pushes: PushPlan | None = None
-    style: AmpConfig | None = field(default_factory=AmpConfig)
+    style: AmpConfig | None = part("poise.learn:AmpConfig")
     termination: Literal["relaxed", "all", "code"] = "relaxed"
     first: float = 0.1
     recovery: bool = True
@@ -201,7 +206,7 @@ class Perpetual:
     composer_hidden: tuple[int, ...] = (256, 128)
     composer_clone: bool = True
     expert: bool = True
-    trajopt: TrajOptConfig | None = None
+    trajopt: TrajOptConfig | None = part("poise.plan:TrajOptConfig", made=False)
     help_start: float = 100.0
     help_share: Annotated[float, Range(0, 1, above=True)] = 0.8
     help_by: Literal["all", "clip", "bin"] = "bin"
@@ -215,21 +220,20 @@ class Perpetual:
     num_envs: int = 512
     horizon: int = 300
     seed: int = 0
-    mining: MiningConfig = field(default_factory=MiningConfig)
-    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
-    clone: CloneConfig | None = None
-    teacher: TeacherConfig | None = None
-    lessons: LessonConfig = field(default_factory=LessonConfig)
-    body: BodyConfig = field(default_factory=BodyConfig)
-    sim: SimConfig = field(default_factory=SimConfig)
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            std=0.02,
-            policy_lr=2e-5,
-            kl_target=0.05,
-            lr_range=(5e-6, 3e-4),
-            policy_hidden=(512, 256),
-        )
+    mining: MiningConfig = part("poise.learn:MiningConfig")
+    convergence: ConvergenceConfig = part("poise.learn:ConvergenceConfig")
+    clone: CloneConfig | None = part("poise.learn:CloneConfig", made=False)
+    teacher: TeacherConfig | None = part("poise.plan:TeacherConfig", made=False)
+    lessons: LessonConfig = part("poise.learn:LessonConfig")
+    body: BodyConfig = part("poise.body:BodyConfig")
+    sim: SimConfig = part("poise.sim:SimConfig")
+    ppo: PPOConfig = part(
+        "poise.learn:PPOConfig",
+        std=0.02,
+        policy_lr=2e-5,
+        kl_target=0.05,
+        lr_range=(5e-6, 3e-4),
+        policy_hidden=(512, 256),
     )
 
     def __post_init__(self) -> None:
@@ -304,6 +308,8 @@ class Perpetual:
         hard motion bin of many tells is lost in small ones, with steps large enough to learn it.
         Adaptive sampling over the whole library draws half of the starts; the others are anywhere.
         Observations are clipped far out, since lying on the floor is far from the mean of walks."""
+        from poise.learn import ConvergenceConfig, MiningConfig
+
         ppo = replace(
             cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3,
             obs_clip=WIDE,
@@ -326,12 +332,14 @@ class Perpetual:
         weights that only have to be positive (softmax), and an episode that is worth nothing after its
         last frame.
         """
+        from poise.learn import AmpConfig, MiningConfig
+
         own: dict[str, Any] = {
             "faithful": "paper", "energy_form": "paper", "termination": "relaxed",
             "style": AmpConfig.phc("paper"), "mining": MiningConfig.phc("paper"),
             "start": "random", "lateral": True, "combine": "product", "weights": "softmax",
         }  # fmt: skip
-        return cls(**(_PHC | own | changes))
+        return cls(**(_phc() | own | changes))
 
     @classmethod
     def code(cls, **changes: Any) -> Perpetual:
@@ -342,17 +350,21 @@ class Perpetual:
         and a discriminator that share PPO's optimiser, a new set of clips in memory every 500 epochs,
         fallen starts alone until a given epoch, and an episode that is worth nothing after its end.
         """
+        from poise.learn import AmpConfig, MiningConfig
+
         own: dict[str, Any] = {
             "faithful": "code", "energy_form": "code", "termination": "code",
             "style": AmpConfig.phc("code"), "mining": MiningConfig.phc("code"),
             "start": "copy", "lateral": False, "combine": "means", "weights": "relu",
         }  # fmt: skip
-        return cls(**(_PHC | own | changes))
+        return cls(**(_phc() | own | changes))
 
     def taught(self) -> Perpetual:
         """The same settings with a teacher that looks ahead. What is observed and done suits it: the
         heading of the hips, later frames, a filter of actions. Most time is the teacher's, and few
         worlds train the critic."""
+        from poise.plan import TeacherConfig
+
         recovering = replace(self.recovering, demonstration_share=0.15)
         return replace(
             self, heading="hips", window=(2, 4, 8), filter=0.5, root=0.2, num_envs=128,
@@ -376,26 +388,33 @@ class Perpetual:
         return 0.0
 
 
-#: What `Perpetual.paper` and `.code` share. The paper: goals, absolute actions, no help, networks of
-#: 1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds, steps.
-_PHC: dict[str, Any] = {
-    "goal": "rotations", "shape": False, "heading": "twist", "action": "absolute",
-    "energy": 0.0005, "first": 0.0,
-    "recovery": True, "recovering": RecoveryPlan(primitive="own", demonstrations=0),
-    "multiplicative": True, "progressive": True, "single": False, "max_primitives": 3,
-    "composer_hidden": (1024, 512), "composer_clone": False, "expert": False, "trajopt": None,
-    "help_start": 0.0, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip",
-    "cooling": 0.0, "num_envs": 3072, "horizon": 300,
-    "body": BodyConfig(damping=0.1, armature=0.02),
-    "sim": SimConfig(rate_hz=60.0, control_hz=30.0),
-    "ppo": PPOConfig(
-        horizon=32, minibatch=16_384, epochs=6, gamma=0.99, lam=0.95, clip=0.2, policy_lr=2e-5,
-        value_lr=2e-5, policy_grad_norm=50.0, value_grad_norm=50.0, policy_hidden=(1024, 512),
-        value_hidden=(1024, 512), activation="relu", std=math.exp(-2.9), bound_weight=10.0,
-        bound_limit=1.0, kl_target=None, kl_stop=None, normalise_returns=True, obs_clip=5.0,
-        bootstrap_timeouts=True,
-    ),
-}  # fmt: skip
+def _phc() -> dict[str, Any]:
+    """What `Perpetual.paper` and `.code` share. The paper: goals, absolute actions, no help, networks of
+    1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds,
+    steps."""
+    from poise.body import BodyConfig
+    from poise.learn import PPOConfig
+    from poise.sim import SimConfig
+
+    return {
+        "goal": "rotations", "shape": False, "heading": "twist", "action": "absolute",
+        "energy": 0.0005, "first": 0.0,
+        "recovery": True, "recovering": RecoveryPlan(primitive="own", demonstrations=0),
+        "multiplicative": True, "progressive": True, "single": False, "max_primitives": 3,
+        "composer_hidden": (1024, 512), "composer_clone": False, "expert": False, "trajopt": None,
+        "help_start": 0.0, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip",
+        "cooling": 0.0, "num_envs": 3072, "horizon": 300,
+        "body": BodyConfig(damping=0.1, armature=0.02),
+        "sim": SimConfig(rate_hz=60.0, control_hz=30.0),
+        "ppo": PPOConfig(
+            horizon=32, minibatch=16_384, epochs=6, gamma=0.99, lam=0.95, clip=0.2, policy_lr=2e-5,
+            value_lr=2e-5, policy_grad_norm=50.0, value_grad_norm=50.0, policy_hidden=(1024, 512),
+            value_hidden=(1024, 512), activation="relu", std=math.exp(-2.9), bound_weight=10.0,
+            bound_limit=1.0, kl_target=None, kl_stop=None, normalise_returns=True, obs_clip=5.0,
+            bootstrap_timeouts=True,
+        ),
+    }  # fmt: skip
+
 
 #: What earlier versions called the settings, and what their runs did that name none.
 MIGRATION = Migration(

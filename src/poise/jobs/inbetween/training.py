@@ -9,20 +9,21 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 
 from poise.errors import PoiseError
 from poise.formats.own import pack_clips
 from poise.formats.table import READERS
+from poise.jobs.inbetween.settings import Contacts, Inbetween
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.folder import library_of
 from poise.kinematics.feet import standing_labels
 from poise.kinematics.rate import read_clip
-from poise.learn.between import Between, BetweenConfig, BetweenObjective, BetweenTraining
+from poise.learn.between import Between, BetweenObjective
 from poise.learn.checkpoint import (
     load_checkpoint,
     load_module,
@@ -40,7 +41,7 @@ from poise.learn.inbetween import (
     save_model,
     train_inbetween,
 )
-from poise.learn.rtn import RTN, RTNConfig, RTNObjective, RTNTraining
+from poise.learn.rtn import RTN, RTNObjective
 from poise.learn.transition import Layout
 from poise.learn.windows import FrameData, Sampler
 from poise.motion import Clip, Skeleton
@@ -54,8 +55,8 @@ from poise.motion.windows import (
     step_contacts,
     without_still_root,
 )
-from poise.score.gaps import LAFAN1, Protocol, TestSet, deviation, evaluate, test_set
-from poise.settings import Checked, from_data, to_data
+from poise.score.gaps import TestSet, deviation, evaluate, test_set
+from poise.settings import from_data, to_data
 
 
 def library_bank(
@@ -170,93 +171,8 @@ def _bank(tensors: dict[str, torch.Tensor], meta: dict[str, Any]) -> FrameBank:
     )  # fmt: skip
 
 
-Contacts = Literal["harvey", "two-stage", "floor"]
 RUN_FILE = "run.safetensors"
 FRAMES = "frames.safetensors"
-
-
-@dataclass(frozen=True)
-class Inbetween(Checked):
-    """Settings of one network's training.
-
-    Attributes:
-        net: transformer or rtn.
-        final, validation: regular expressions in the names of clips that are kept apart (see
-            `score.gaps.Protocol`); final clips are never read by training or choices.
-        contacts: the labels that the network learns: Harvey et al.'s or Skeleton2Humanoid's, which tell
-            from steps alone, or "floor", of slow feet near it, for recordings with sliding feet.
-        ema: of the averaged weights that are used.
-        mirror: whether it learns from every clip in a mirror, too.
-        stretch: windows are drawn up to so many times faster and slower than recorded.
-        onto: a motion file; `library_of` brings all clips onto its skeleton and cuts what no character
-            can do alone on a floor.
-        reading: how it reads them; given alone, all come onto the skeleton that most seconds are on. By
-            default clips of the most common skeleton are taken as they are.
-    """
-
-    net: Literal["transformer", "rtn"] = "transformer"
-    name: str = "library"
-    final: str = r"(?!)"
-    validation: str | None = None
-    contacts: Contacts = "floor"
-    fps: float = 30.0
-    seed: int = 0
-    ema: float = 0.999
-    mirror: bool = False
-    stretch: float = 1.0
-    onto: str | None = None
-    reading: LibraryConfig | None = None
-    between: BetweenConfig = field(default_factory=BetweenConfig)
-    between_training: BetweenTraining = field(default_factory=BetweenTraining)
-    rtn: RTNConfig = field(default_factory=RTNConfig)
-    rtn_training: RTNTraining = field(default_factory=RTNTraining)
-
-    @classmethod
-    def paper(cls, **changes: Any) -> Inbetween:
-        """Harvey et al. 2020 on LAFAN1 as stated, with the loss of Skeleton2Humanoid's Eq. 3.
-
-        Its alpha is stated nowhere and neither is the width of the LSTM; both are ours.
-        """
-        own: dict[str, Any] = {
-            "net": "rtn", "name": LAFAN1.name, "final": LAFAN1.final, "contacts": "harvey", "fps": 30.0,
-            "ema": 0.0, "mirror": False, "stretch": 1.0,
-            "rtn": RTNConfig(encoder=(512, 256), decoder=(512, 256), past=10, longest=30, noise=0.5),
-            "rtn_training": RTNTraining(
-                batch=32, lr=1e-3, decay=False, shortest=5, quat=1.0, pos=1.0, root=0.5, contact=0.1,
-                adversarial=0.1, equalise=True, products="float32",
-            ),
-        }  # fmt: skip
-        return cls(**(own | changes))
-
-    @classmethod
-    def code(cls, **changes: Any) -> Inbetween:
-        """The same as public re-implementations have it: an LSTM of 768 units, clips in a mirror, too,
-        an adversarial weight of 0.01, and gradients scaled down to 1.
-
-        Neither paper has published code of its training. Not expressed: critics with windows other
-        than 10 and 2 frames, and their other weights of losses, on which they disagree.
-        """
-        own = cls.paper()
-        rtn, how = (
-            replace(own.rtn, hidden=768),
-            replace(own.rtn_training, adversarial=0.01, grad_norm=1.0, equalise=False),
-        )
-        return replace(own, **({"mirror": True, "rtn": rtn, "rtn_training": how} | changes))
-
-    @property
-    def protocol(self) -> Protocol:
-        """The split and the windows by which it is scored."""
-        return Protocol(self.name, self.final, self.validation)
-
-    @property
-    def batch(self) -> int:
-        """Windows per step."""
-        return (self.between_training if self.net == "transformer" else self.rtn_training).batch
-
-    @property
-    def longest(self) -> int:
-        """The longest gap that is trained."""
-        return self.between_training.longest if self.net == "transformer" else self.rtn.longest
 
 
 @dataclass(frozen=True, eq=False)
@@ -427,15 +343,6 @@ def validation(task: Task, lengths: tuple[int, ...] = (5, 15, 30)) -> Callable[.
         return {k: v for k, v in out.items() if math.isfinite(v)}
 
     return check
-
-
-def small(config: Inbetween) -> Inbetween:
-    """A network that trains in minutes, for trials and tests."""
-    return replace(
-        config,
-        between=BetweenConfig(width=64, layers=2, heads=4, feedforward=128, latent=4),
-        rtn=RTNConfig(hidden=64, encoder=(64, 32), decoder=(64, 32)),
-    )
 
 
 #: Expected figures: see `benchmarks/inbetween.md`, which `benchmarks/inbetween.py` writes.

@@ -199,7 +199,7 @@ class Compliant:
             )
         if not (self.reach or self.added(0).forces):
             what = "reach must be above 0 where there are no forces to learn, got 0"
-            raise PoiseError(what, "compliant")
+            raise PoiseError(what, "compliant", code="settings-conflict")
 
     def added(self, seen: int) -> Added:
         """What is learned on top of a policy that sees so many numbers."""
