@@ -13,13 +13,16 @@ import contextlib
 import dataclasses
 import json
 import math
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import cache
+from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
+    Annotated,
     Any,
     Literal,
     TypeGuard,
@@ -103,32 +106,261 @@ def from_data(kind: type[T], data: Any, where: Path | str | None = None) -> T:
     return _made(kind, data, "", where)
 
 
-def validate(config: Any) -> None:
-    """Refuses a settings object with a value that its fields cannot have; for `__post_init__`.
+@dataclass(frozen=True)
+class Range:
+    """The numbers that a field may have, declared with it: `share: Annotated[float, Range(0, 1)] = 0.5`.
 
-    A `Literal` field must have one of its values, and a `seed` must fit the random generators.
+    Each number of a tuple must lie in it; NaN never does.
+
+    Attributes:
+        low, high: the limits.
+        above, below: `low`, or `high`, itself is none of the numbers.
+        rising: no number of a tuple is below the one before it.
+        infinite: infinity is one of them, on a side without a limit.
+        unit: the word behind the limits, such as "kg".
+        hint: what to do about another number.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    below: bool = False
+    rising: bool = False
+    infinite: bool = False
+    unit: str = ""
+    hint: str = ""
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """The least and the largest number of the range, both in it."""
+        low = math.nextafter(self.low, math.inf) if self.above else self.low
+        high = math.nextafter(self.high, -math.inf) if self.below else self.high
+        most = math.inf if self.infinite else sys.float_info.max
+        return max(low, -most), min(high, most)
+
+    def holds(self, number: float) -> bool:
+        """Whether a number lies in the range."""
+        low, high = self.limits
+        return low <= number <= high
+
+    def check(self, number: float, name: str, where: str | None = None) -> None:
+        """Refuses a number that is called `name`, by a PoiseError."""
+        if not self.holds(number):
+            raise PoiseError(
+                f"{name} must {self}, got {number!r}", where, self.hint or None, code="out-of-range"
+            )
+
+    def __str__(self) -> str:
+        """What a number must do, as behind "must"."""
+        unit = f" {self.unit}" if self.unit else ""
+        low = f"{'above' if self.above else 'at least'} {self.low:g}"
+        high = f"{'below' if self.below else 'at most'} {self.high:g}"
+        if math.isinf(self.low) and math.isinf(self.high):
+            return "be a number" if self.infinite else "be a finite number"
+        if math.isinf(self.low) or math.isinf(self.high):
+            return f"be {low if math.isinf(self.high) else high}{unit}"
+        if self.above or self.below:
+            return f"be {low} and {high}{unit}"
+        return f"lie in {self.low:g} to {self.high:g}{unit}"
+
+
+@dataclass(frozen=True)
+class Length:
+    """How many values a field may have, declared with it: `Annotated[tuple[int, ...], Length(1)]`."""
+
+    low: int = 0
+    high: float = math.inf
+
+    def __str__(self) -> str:
+        """What a field must do, as behind "must"."""
+        many = self.low if math.isinf(self.high) else self.high
+        how = "" if self.low == self.high else "at least " if math.isinf(self.high) else "at most "
+        how = f"{self.low} to " if how == "at most " and self.low else how
+        return f"have {how}{many:g} value{'' if many == 1 else 's'}"
+
+
+#: The ranges that most fields have.
+Share = Annotated[float, Range(0, 1)]
+Positive = Annotated[float, Range(0, above=True)]
+NotNegative = Annotated[float, Range(0)]
+Count = Annotated[int, Range(1)]
+#: Of what is limited, infinite for no limit.
+Limit = Annotated[float, Range(0, infinite=True)]
+
+
+class Checked:
+    """Base of dataclasses that need no other check than `validate`."""
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+def validate(config: Any, where: str | None = None) -> None:
+    """Refuses a dataclass with a value that its fields do not declare; for `__post_init__`.
+
+    A `Literal` field must have one of its values. Numbers must lie in the declared `Range`; floats
+    without one must be finite. A tuple must have as many values as its type or `Length` says. A `seed`
+    must fit the random generators.
+
+    Args:
+        where: what an error calls the object; by default its class and, if it has one, its name.
 
     Raises:
-        PoiseError: another value, with the nearest one that there is.
+        PoiseError: another value, with the values that are allowed.
     """
-    own = cast("type[Any]", type(config))
-    name = own.__name__
-    for f in fields(config):
-        value, known = getattr(config, f.name), _choices(_types(own)[f.name])
-        if known and value not in known:
-            texts = [str(k) for k in known]
-            raise PoiseError(
-                f"{f.name} cannot be {_short(value)}",
-                name,
-                did_you_mean(str(value)[:40], texts),
-                code="unknown-choice",
-            )
-        if f.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
-            raise PoiseError(
-                f"seed must be a whole number from 0 to 2**63 - 1, got {value!r}",
-                name,
-                code="out-of-range",
-            )
+    for one, name, low, high in _declared(cast("type[Any]", type(config))):
+        value: object = getattr(config, name)
+        if (type(value) is float or type(value) is int) and low <= value <= high:
+            continue  # Most fields are done here.
+        what = one.refuses(value)
+        if what:
+            if where is None:
+                where, called = type(config).__name__, getattr(config, "name", None)
+                where = f"{where} '{called}'" if isinstance(called, str) else where
+            code = "unknown-choice" if one.choices else "out-of-range"
+            raise PoiseError(f"{name} {what}", where, one.hint(value), code=code)
+
+
+@dataclass(frozen=True)
+class _Declared:
+    """What one field of a dataclass declares.
+
+    Attributes:
+        choices: of a `Literal`; () where anything goes.
+        range, length: of its numbers, and of its tuple; None where anything goes.
+        inner: of each tuple in its tuple.
+        none: whether it, or a value in it, may be None.
+        numeric: whether its type names numbers, and tuples of them, alone.
+        listed: whether its type names tuples alone.
+    """
+
+    name: str
+    choices: tuple[Any, ...]
+    range: Range | None
+    length: Length | None
+    inner: Length | None
+    none: bool
+    numeric: bool
+    listed: bool
+
+    def refuses(self, value: Any) -> str:
+        """What is wrong with a value, "" where it is right."""
+        if self.choices:
+            return "" if value in self.choices else f"cannot be {_short(value)}"
+        if self.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
+            return f"must be a whole number from 0 to 2**63 - 1, got {value!r}"
+        if value is None and self.none:
+            return ""
+        if self.numeric and type(value) is not tuple:
+            # Numbers and arrays of NumPy and of PyTorch are as their plain values.
+            value = _plain_number(value)
+        if not _is_list(value):
+            if self.listed:
+                return f"must {self.length or 'be a tuple'}, got {_short(value)}"
+            return "" if self._within(value) else f"must {self.range}, got {_short(value)}"
+        rising = self.range is not None and self.range.rising
+        if not self._within(value):
+            each = "" if rising else " in each value"
+            return f"must {'rise and ' * rising}{self.range}{each}, got {_short(value)}"
+        if rising and any(a > b for a, b in pairwise(value)):
+            return f"must rise and {self.range}, got {_short(value)}"
+        length, inner = self.length, self.inner
+        if length is not None and not length.low <= len(value) <= length.high:
+            return f"must {length}, got {_short(value) if len(value) < 9 else len(value)}"
+        if inner is not None and not all(_is_list(v) and len(v) == inner.low for v in value):
+            return f"must hold tuples that {inner}, got {_short(value)}"
+        return ""
+
+    def hint(self, value: Any) -> str | None:
+        """What to do about a value that is refused."""
+        if self.choices:
+            return did_you_mean(str(value)[:40], [str(c) for c in self.choices])
+        return (self.range.hint if self.range else "") or None
+
+    def _within(self, value: Any) -> bool:
+        """Whether all numbers of a value lie in the range."""
+        if self.range is None:
+            return True
+        if isinstance(value, float | int):
+            return self.range.holds(value)
+        if _is_list(value):
+            low, high = self.range.limits
+            return all(low <= v <= high if type(v) is float else self._within(v) for v in value)
+        return self.none if value is None else not self.numeric
+
+
+@cache
+def _declared(kind: type) -> tuple[tuple[_Declared, str, float, float], ...]:
+    """What the fields of a dataclass declare, but for those that may be anything: each with its name and
+    the limits of a plain number."""
+    hints = get_type_hints(kind, include_extras=True)
+    out: list[tuple[_Declared, str, float, float]] = []
+    for f in fields(kind):
+        hint = hints[f.name]
+        leaves, marks = _parts(hint)
+        own = leaves - {NoneType}
+        range_ = next((m for m in marks if isinstance(m, Range)), Range() if float in own else None)
+        length = next((m for m in marks if isinstance(m, Length)), _fixed(hint))
+        inner = next((n for n in map(_fixed, _items(hint)) if n is not None), None)
+        choices, listed = _choices(hint), _listed(hint)
+        if not f.init or not (choices or range_ or length or inner or f.name == "seed"):
+            continue
+        one = _Declared(
+            f.name, choices, range_, length, inner, NoneType in leaves, own <= {float, int}, listed
+        )
+        # Where a plain number is not enough, no number lies between the limits.
+        plain = range_ is not None and not (listed or choices or f.name == "seed")
+        low, high = range_.limits if range_ is not None and plain else (math.inf, -math.inf)
+        out.append((one, f.name, low, high))
+    return tuple(out)
+
+
+def _parts(hint: Any) -> tuple[set[Any], list[Any]]:
+    """The types of the values in a field, tuples taken apart, and what `Annotated` adds."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        leaves, marks = _parts(args[0])
+        return leaves, [*args[1:], *marks]
+    if origin is Literal:
+        return {type(a) for a in args}, []
+    if origin not in (Union, UnionType, tuple, list):
+        return {origin or hint}, []
+    parts = [_parts(a) for a in args if a is not ...]
+    leaves: set[Any] = set[Any]().union(*(leaf for leaf, _ in parts))
+    return leaves, [m for _, marks in parts for m in marks]
+
+
+def _fixed(hint: Any) -> Length | None:
+    """How many values the tuple of a type has, None where that is left open."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _fixed(args[0])
+    if origin in (Union, UnionType):
+        return next((n for n in map(_fixed, args) if n is not None), None)
+    return Length(len(args), len(args)) if origin is tuple and args and ... not in args else None
+
+
+def _listed(hint: Any) -> bool:
+    """Whether a type names tuples alone, or None."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _listed(args[0])
+    if origin in (Union, UnionType):
+        return all(_listed(a) for a in args if a is not NoneType)
+    return origin is tuple
+
+
+def _items(hint: Any) -> tuple[Any, ...]:
+    """The type of the values of a `tuple[..., ...]`."""
+    args = get_args(hint)
+    if get_origin(hint) is Annotated:
+        return _items(args[0])
+    return args[:1] if get_origin(hint) is tuple and ... in args else ()
+
+
+def _plain_number(value: Any) -> Any:
+    """Numbers and arrays of NumPy and of PyTorch as plain ones, anything else as it is."""
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def changed(config: T, settings: Mapping[str, Any]) -> T:
@@ -152,6 +384,8 @@ def _choices(kind: Any) -> tuple[Any, ...]:
     origin, args = get_origin(kind), get_args(kind)
     if origin is Literal:
         return args
+    if origin is Annotated:
+        return _choices(args[0])
     if origin in (Union, UnionType):
         own = [_choices(a) if a is not NoneType else (None,) for a in args]
         return () if () in own else tuple(v for part in own for v in part)

@@ -178,9 +178,9 @@ def test_wrong_overrides_are_told(changes, message):
 
 
 def test_wrong_settings_and_skeletons_are_told():
-    with refused("out-of-range", says="0.5"):
+    with refused("out-of-range", says=("mass_kg", "0.5")):
         BodyConfig(mass_kg=0.5)
-    with refused("unknown-choice", says="preset"):
+    with refused("unknown-choice", says=("preset", "robot")):
         BodyConfig(preset="robot")
     flat = replace(human(), offsets=np.zeros((len(human()), 3)))
     with refused("limb-too-short", says="0.0"):

@@ -35,7 +35,7 @@ def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[st
     [
         (["--seconds", "0"], "--seconds must lie in 0.1 to 36000"),
         (["--steer", "5"], "'5' is no point"),
-        (["--count", "99"], "1 to 16 characters"),
+        (["--count", "99"], "count must lie in 1 to 16 characters"),
         (["--temperature", "-1"], "temperature must lie in 0 to 10"),
         (["--generator", "none"], "could not be read"),
         (["--past", "none"], "--past"),

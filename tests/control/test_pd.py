@@ -28,7 +28,7 @@ def test_targets_by_hand():
     drive.clear()
     PDTargets("absolute", offset=torch.tensor([0.5, 0.5])).apply(action, ref, drive)
     torch.testing.assert_close(drive.ctrl, torch.tensor([[0.6, 0.3]]))
-    with refused("unknown-choice"):
+    with refused("unknown-choice", says=("mode", "relative")):
         PDTargets("relative")
 
 

@@ -206,10 +206,10 @@ def test_regularizers_by_hand():
 
 def test_mistakes_are_told():
     for value in (-1.0, math.inf, math.nan):
-        with refused("out-of-range", says="force"):
+        with refused("out-of-range", says="limit_n"):
             ImplicitResidual(limit_n=value)
-        with refused("out-of-range", says="torque"):
+        with refused("out-of-range", says="limit_nm"):
             ExplicitResidual(limit_nm=value)
-    for bodies in ((), (1, 1)):
-        with refused("name-repeated"):
+    for bodies, code in (((), "out-of-range"), ((1, 1), "name-repeated")):
+        with refused(code, says="bodies"):
             ExplicitResidual(bodies)

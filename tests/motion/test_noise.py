@@ -256,9 +256,9 @@ def test_a_ladder() -> None:
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    with refused("out-of-range", says=("strength", "Jitter")):
+    with refused("out-of-range", says=("Jitter", "strength")):
         Jitter(strength=-1.0)
-    with refused("out-of-range", says=("share", "Dropouts")):
+    with refused("out-of-range", says=("Dropouts", "share")):
         Dropouts(share=float("nan"))
     with refused("no-direction"):
         moved(Jitter(axis=(0.0, 0.0, 0.0)), 5)

@@ -96,7 +96,7 @@ def test_the_critic_goes_with_the_policy(tracker: Tracker, tmp_path: Path) -> No
 def test_bad_settings_are_refused() -> None:
     with refused("out-of-range", says="4 characters"):
         SamplingConfig(characters=4)
-    with refused("out-of-range"):
+    with refused("out-of-range", says="noise_range"):
         SamplingConfig(noise_range=(0.3, 0.1))
     with refused("single-character-only"):
         TrackConfig(controller="search", count=2)

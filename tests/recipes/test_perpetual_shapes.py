@@ -243,7 +243,7 @@ def test_real_clips_stand_where_they_stood(data_dir: Path) -> None:
 
 
 def test_bad_settings_and_bodies(imitation: Imitation) -> None:
-    with refused("out-of-range"):
+    with refused("out-of-range", says="count"):
         BodyShapes(count=0)
     with refused("not-rising"):
         BodyShapes(low=1.2, high=1.1)

@@ -350,7 +350,7 @@ def test_links_of_bodies_far_apart() -> None:
 
 
 def test_mistakes_get_a_sentence(humanoid: Humanoid, tmp_path: Path) -> None:
-    with refused("over-limit", says=("500", "10000")):
+    with refused("out-of-range", says=("things", "10000")):
         Scene(tuple(Box(f"b{k}") for k in range(10_000)))
     with refused("name-repeated", says=("things", "box")):
         Scene((Box(), Box()))

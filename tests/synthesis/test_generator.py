@@ -209,7 +209,7 @@ def test_what_makes_no_sense_is_refused(
     other = GeneratorModel(model.net, model.seeds, model.bounds, ("a",), 30.0)
     with refused("bodies-differ"):
         other.generator(tracker.humanoid)
-    with refused("out-of-range"):
+    with refused("out-of-range", says="past"):
         CVAEConfig(past=1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from poise.body.table import PARTS, BodyRow, BodyTable, Strength, default_mass, 
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate
+from poise.settings import Range, validate
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -38,8 +40,8 @@ class BodyConfig:
         mjcf: a file with a body of the user's own in place of a generated one, see `read_mjcf`.
     """
 
-    mass_kg: float | None = None
-    preset: str = "auto"
+    mass_kg: Annotated[float, Range(2, 5000, unit="kg")] | None = None
+    preset: Literal["auto", "cmu-rfc", "generic"] = "auto"
     damping: float = 0.02
     armature: float = 0.01
     friction: float = 1.0
@@ -48,15 +50,7 @@ class BodyConfig:
     mjcf: str | None = None
 
     def __post_init__(self) -> None:
-        if self.preset not in ("auto", "cmu-rfc", "generic"):
-            raise PoiseError(
-                f"body preset must be auto, cmu-rfc or generic, got '{self.preset}'",
-                code="unknown-choice",
-            )
-        if self.mass_kg is not None and not 2.0 <= self.mass_kg <= 5000.0:
-            raise PoiseError(
-                f"the mass must lie between 2 and 5000 kg, got {self.mass_kg:g}", code="out-of-range"
-            )
+        validate(self)
         if self.mass_kg is not None and self.mjcf is not None:
             raise PoiseError(
                 "a body of your own has its own mass; state one or the other",

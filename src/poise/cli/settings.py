@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_args
 
 import poise
 from poise.errors import PoiseError
@@ -32,6 +32,8 @@ SOURCES = {
     "compliant": ("papers/compliant/training.py", "Compliant"),
 }
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str}
+#: Those with a range, in `poise.settings`.
+_TYPES |= {"Share": float, "Positive": float, "NotNegative": float, "Count": int, "Limit": float}
 #: Of fields that need no entry in a recipe.
 _UNSAID = {
     "num_envs": "environments that are simulated at once.",
@@ -103,6 +105,8 @@ def _type_of(node: ast.expr, known: Mapping[str, Any]) -> Any:
     """The plain type that an annotation names, without its None; None for any other."""
     if isinstance(node, ast.BinOp):
         return _type_of(node.left, known)
+    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Annotated":
+        return _type_of(cast("ast.Tuple", node.slice).elts[0], known)
     if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
         return Literal[ast.literal_eval(node.slice)]
     return known.get(node.id) if isinstance(node, ast.Name) else None

@@ -31,13 +31,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError, did_you_mean
+from poise.settings import Checked, NotNegative, Positive, Range
 
 #: Share of the largest eigenvalue of J W J^T below which a direction counts as none.
 RANK = 1e-4
@@ -46,13 +47,24 @@ PAPER_STEP_S = 1.0 / 600.0
 #: Levels above which joints leave plausible ranges (Sec. 5.2).
 PLAUSIBLE = 0.2
 
+#: What a level can be, and a stiffness.
+LEVEL = Range(
+    0,
+    1,
+    hint="Above 1 it would run away from the force; 0.16 gives way as in the paper, above 0.2 joints "
+    "become implausible",
+)
+STIFFNESS = Range(0, above=True, unit="N/m")
+Level = Annotated[float, LEVEL]
+NewtonsPerMetre = Annotated[float, STIFFNESS]
+
 Law = Literal["eq8", "algorithm1"]
 #: A part by its kind ("thigh") or its name ("lfemur"), and a number.
 Parts = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
-class Compliance:
+class Compliance(Checked):
     """How a motion gives way, by the paper.
 
     Attributes:
@@ -76,36 +88,16 @@ class Compliance:
             `level`.
     """
 
-    level: float = 0.16
+    level: Level = 0.16
     law: Law = "eq8"
-    axes: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    joints: Parts = ()
-    weights: Parts = (("thigh", 2.0), ("upper_arm", 2.0))
+    axes: Annotated[tuple[float, float, float], Range(0, 1)] = (1.0, 1.0, 1.0)
+    joints: Annotated[Parts, Range(0, 1)] = ()
+    weights: Annotated[Parts, Range(0, above=True)] = (("thigh", 2.0), ("upper_arm", 2.0))
     weighting: Literal["inverse", "printed"] = "inverse"
     root: bool = True
-    return_hz: float = 1.0
-    least_n: float = 1.0
-    drawn: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        for level in (self.level, *(self.drawn or ())):
-            check_level(level)
-        if self.law not in ("eq8", "algorithm1"):
-            raise PoiseError(
-                f"the law is eq8 or algorithm1, got '{self.law}'", "Compliance", code="unknown-choice"
-            )
-        if self.weighting not in ("inverse", "printed"):
-            raise PoiseError(
-                f"weighting is inverse or printed, got '{self.weighting}'",
-                "Compliance",
-                code="unknown-choice",
-            )
-        shares = [*self.axes, *(v for _, v in self.joints)]
-        if len(self.axes) != 3 or not all(0.0 <= s <= 1.0 for s in shares):
-            raise PoiseError(
-                "shares of axes and joints must lie in 0 to 1", "Compliance", code="out-of-range"
-            )
-        _check_rest(self.weights, self.return_hz, self.least_n, "Compliance")
+    return_hz: Positive = 1.0
+    least_n: NotNegative = 1.0
+    drawn: Annotated[tuple[float, float], LEVEL] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -119,7 +111,7 @@ class Compliance:
 
 
 @dataclass(frozen=True)
-class Stiffness:
+class Stiffness(Checked):
     """How a motion gives way by a stiffness that is commanded: an admittance on the goal.
 
     u goes to J^+ f (1 / K - c) with a lag, where c is how far the servos alone give way per newton along
@@ -135,58 +127,16 @@ class Stiffness:
         weights, root, return_hz, least_n: see `Compliance`; the root stands by default.
     """
 
-    newtons_per_metre: float = 200.0
-    lag_s: float = 0.1
+    newtons_per_metre: NewtonsPerMetre = 200.0
+    lag_s: Positive = 0.1
     series: bool = True
     hindsight: bool = False
-    weights: Parts = (("thigh", 2.0), ("upper_arm", 2.0))
+    weights: Annotated[Parts, Range(0, above=True)] = (("thigh", 2.0), ("upper_arm", 2.0))
     root: bool = False
-    return_hz: float = 1.0
-    least_n: float = 0.2
-
-    def __post_init__(self) -> None:
-        check_stiffness(self.newtons_per_metre)
-        if not self.lag_s > 0.0:
-            raise PoiseError(
-                f"lag_s must be above 0, got {self.lag_s:g}", "Stiffness", code="out-of-range"
-            )
-        _check_rest(self.weights, self.return_hz, self.least_n, "Stiffness")
+    return_hz: Positive = 1.0
+    least_n: NotNegative = 0.2
 
     notes = ()
-
-
-def check_level(level: float) -> None:
-    """Refuses a level of compliance that is none.
-
-    Raises:
-        PoiseError: it lies outside of 0 to 1.
-    """
-    if not 0.0 <= level <= 1.0:
-        why = ": above 1 it would run away from the force" if level > 1.0 else ""
-        raise PoiseError(
-            f"the level of compliance must lie in 0 to 1, got {level:g}{why}",
-            hint="0.16 gives way as in the paper, above 0.2 joints become implausible",
-            code="out-of-range",
-        )
-
-
-def check_stiffness(newtons_per_metre: float) -> None:
-    """Refuses a stiffness that is none.
-
-    Raises:
-        PoiseError: it is not above 0.
-    """
-    if not 0.0 < newtons_per_metre < math.inf:
-        raise PoiseError(
-            f"a stiffness must be above 0 N/m, got {newtons_per_metre:g}", code="out-of-range"
-        )
-
-
-def _check_rest(weights: Parts, return_hz: float, least_n: float, where: str) -> None:
-    if not all(0.0 < w < math.inf for _, w in weights):
-        raise PoiseError("weights of columns must be above 0", where, code="out-of-range")
-    if not return_hz > 0.0 or not least_n >= 0.0:
-        raise PoiseError("return_hz must be above 0 and least_n at least 0", where, code="out-of-range")
 
 
 def columns(table: BodyTable, parts: Parts, root: bool) -> Tensor:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from poise.errors import PoiseError
+from poise.settings import Checked
 from poise.sim.drive import Drive
 
 
 @dataclass(frozen=True)
-class PDTargets:
+class PDTargets(Checked):
     """Actions become target angles `u` of the PD servos (RFC Eq. 1).
 
     Attributes:
@@ -22,15 +23,9 @@ class PDTargets:
         offset: `(n)` rad, used by "absolute" only (zeros if None, as in PHC).
     """
 
-    mode: str = "additive"
+    mode: Literal["additive", "absolute"] = "additive"
     scale: float | Tensor = 1.0
     offset: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        if self.mode not in ("additive", "absolute"):
-            raise PoiseError(
-                f"the action must be additive or absolute, got '{self.mode}'", code="unknown-choice"
-            )
 
     def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, quat_rotate
+from poise.settings import Checked, Length, NotNegative, Range, Share, validate
 from poise.sim.drive import Drive
 
 
@@ -80,14 +81,6 @@ def _of_worlds(scale: Tensor | float) -> Tensor | float:
     return scale
 
 
-def _check_limits(limit_n: float, limit_nm: float) -> None:
-    for name, value in (("force", limit_n), ("torque", limit_nm)):
-        if not 0.0 <= value < float("inf"):
-            raise PoiseError(
-                f"the residual {name} limit must be at least 0, got {value}", code="out-of-range"
-            )
-
-
 def _capped(vectors: Tensor) -> Tensor:
     """Vectors `(N, M, 3)` scaled down where the sum over M of their norms exceeds 1."""
     total = vectors.norm(dim=-1).sum(-1)
@@ -95,7 +88,7 @@ def _capped(vectors: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ImplicitResidual:
+class ImplicitResidual(Checked):
     """RFC-Implicit: a wrench on the root's six degrees of freedom (paper Eqs. 4 and 5).
 
     Action (6): force in the root's heading frame and torque in the root's own frame, in units of
@@ -108,13 +101,10 @@ class ImplicitResidual:
         capped: whether the limits bound the help, or only scale the action.
     """
 
-    limit_n: float = 100.0
-    limit_nm: float = 100.0
+    limit_n: NotNegative = 100.0
+    limit_nm: NotNegative = 100.0
     k_r: float = 1.0
     capped: bool = True
-
-    def __post_init__(self) -> None:
-        _check_limits(self.limit_n, self.limit_nm)
 
     @property
     def dims(self) -> int:
@@ -164,17 +154,17 @@ class ExplicitResidual:
             action.
     """
 
-    bodies: tuple[int, ...] = (0,)
-    limit_n: float = 100.0
-    limit_nm: float = 100.0
+    bodies: Annotated[tuple[int, ...], Length(1)] = (0,)
+    limit_n: NotNegative = 100.0
+    limit_nm: NotNegative = 100.0
     k_f: float = 1.0
     k_cp: float = 4.0
     reach_m: float = 0.3
     capped: bool = True
 
     def __post_init__(self) -> None:
-        _check_limits(self.limit_n, self.limit_nm)
-        if not self.bodies or len(set(self.bodies)) != len(self.bodies):
+        validate(self)
+        if len(set(self.bodies)) != len(self.bodies):
             raise PoiseError(
                 f"explicit residual forces need different bodies, got rows {self.bodies}",
                 code="name-repeated",
@@ -251,18 +241,18 @@ class LinearHelp:
         every: control steps between two decisions.
     """
 
-    start: int
+    start: Annotated[int, Range(0)]
     stop: int
-    final: float = 0.0
+    final: Share = 0.0
     every: int = 16
 
     def __post_init__(self) -> None:
-        if not 0 <= self.start < self.stop:
+        validate(self)
+        if not self.start < self.stop:
             raise PoiseError(
                 f"help must fall from one step to a later one, got {self.start}, {self.stop}",
                 code="not-rising",
             )
-        _check_final(self.final)
 
     def scale(self, scale: float, steps: int, success: float) -> float:
         """A function of the steps alone."""
@@ -289,21 +279,16 @@ class SuccessHelp:
 
     lower_at: float = 0.5
     raise_at: float = 0.3
-    factor: float = 0.98
-    smallest: float = 0.05
-    final: float = 0.0
+    factor: Annotated[float, Range(0, 1, above=True, below=True)] = 0.98
+    smallest: Annotated[float, Range(0, 1, above=True)] = 0.05
+    final: Share = 0.0
     every: int = 16
 
     def __post_init__(self) -> None:
+        validate(self)
         if not 0 < self.raise_at < self.lower_at <= 1:
             raise PoiseError(f"success must satisfy 0 < raise_at {self.raise_at} < lower_at "
                              f"{self.lower_at} <= 1", code="not-rising")  # fmt: skip
-        if not (0 < self.factor < 1 and 0 < self.smallest <= 1):
-            raise PoiseError(
-                f"factor and smallest must lie in (0, 1), got {self.factor}, {self.smallest}",
-                code="out-of-range",
-            )
-        _check_final(self.final)
 
     def scale(self, scale: float, steps: int, success: float) -> float:
         """One notch down, up, or none."""
@@ -313,10 +298,3 @@ class SuccessHelp:
         if success < self.raise_at:
             return min(1.0, max(scale, self.smallest) / self.factor)
         return scale
-
-
-def _check_final(final: float) -> None:
-    if not 0 <= final <= 1:
-        raise PoiseError(
-            f"the last scale of the help must lie in [0, 1], got {final}", code="out-of-range"
-        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from poise.env.recovery.planner import way_to_stand
 from poise.env.stream import BufferedGoal
 from poise.errors import PoiseError
 from poise.metrics import has_lost
+from poise.settings import Checked, Range
 
 
 class MotionGenerator(Protocol):
@@ -138,7 +139,7 @@ PROPOSALS, FEW = 240, 24
 
 
 @dataclass(frozen=True)
-class Steering:
+class Steering(Checked):
     """Targets one after another, and distance from each other.
 
     Attributes:
@@ -147,13 +148,8 @@ class Steering:
         apart: whether characters of one world keep away from each other.
     """
 
-    targets: tuple[tuple[float, float], ...] = ()
+    targets: Annotated[tuple[tuple[float, float], ...], Range(-FAR, FAR, unit="m")] = ()
     apart: bool = False
-
-    def __post_init__(self) -> None:
-        for x, y in self.targets:
-            if not (abs(x) <= FAR and abs(y) <= FAR):
-                raise PoiseError(f"a target lies within {FAR:g} m, got {x:g},{y:g}", code="out-of-range")
 
     @property
     def chooses(self) -> bool:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -13,11 +13,12 @@ from poise.env.goal import Goal
 from poise.env.plugins import Felt, Plugin
 from poise.env.reference import Start
 from poise.errors import PoiseError
+from poise.settings import Checked, Count, Length, Positive, Range, Share
 from poise.sim import Backend, Drive
 
 
 @dataclass(frozen=True)
-class Push:
+class Push(Checked):
     """A constant force on one body for some time of each episode; given to `TaskConfig.plugins`.
 
     Attributes:
@@ -30,19 +31,11 @@ class Push:
             and know of no push to come.
     """
 
-    row: int
+    row: Annotated[int, Range(0)]
     force: tuple[float, float, float]
-    first: int
-    steps: int
+    first: Annotated[int, Range(0)]
+    steps: Count
     foreseen: bool = True
-
-    def __post_init__(self) -> None:
-        if self.row < 0 or self.first < 0 or self.steps < 1:
-            raise PoiseError(
-                "row and first must be at least 0, steps at least 1", "Push", code="out-of-range"
-            )
-        if not all(math.isfinite(f) for f in self.force):
-            raise PoiseError(f"the force is not finite: {self.force}", "Push", code="not-finite")
 
     def __call__(self, goal: Goal, backend: Backend) -> OnePush:
         """The plug-in of an environment."""
@@ -118,7 +111,7 @@ NEVER = 10**9
 
 
 @dataclass(frozen=True)
-class Pushes:
+class Pushes(Checked):
     """Pushes on random bodies at random times, each of a random horizontal direction; given to
     `TaskConfig.plugins`.
 
@@ -133,35 +126,14 @@ class Pushes:
         seed: of the draws.
     """
 
-    newtons: tuple[float, float] = (50.0, 200.0)
-    every_s: tuple[float, float] = (1.0, 3.0)
-    lasts_s: float | tuple[float, float] = 0.2
-    bodies: tuple[int, ...] = (0,)
-    control_hz: float = 30.0
+    newtons: Annotated[tuple[float, float], Range(0, rising=True, unit="N")] = (50.0, 200.0)
+    every_s: Annotated[tuple[float, float], Range(0, rising=True, unit="s")] = (1.0, 3.0)
+    lasts_s: Annotated[float | tuple[float, float], Range(0, above=True, rising=True, unit="s")] = 0.2
+    bodies: Annotated[tuple[int, ...], Length(1)] = (0,)
+    control_hz: Positive = 30.0
     seed: int = 0
-    share: float = 1.0
-    impulse_ns: float = float("inf")
-
-    def __post_init__(self) -> None:
-        for name in ("newtons", "every_s"):
-            low, high = getattr(self, name)
-            if not 0.0 <= low <= high < float("inf"):
-                raise PoiseError(
-                    f"{name} must rise from at least 0, got {low:g} to {high:g}",
-                    "Pushes",
-                    code="not-rising",
-                )
-        low, high = self.lasting
-        if not (0.0 < low <= high and self.control_hz > 0.0 and self.impulse_ns > 0.0):
-            raise PoiseError(
-                "lasts_s, control_hz and impulse_ns must be above 0", "Pushes", code="out-of-range"
-            )
-        if not 0.0 <= self.share <= 1.0:
-            raise PoiseError(
-                f"share must lie in 0 to 1, got {self.share:g}", "Pushes", code="out-of-range"
-            )
-        if not self.bodies:
-            raise PoiseError("pushes need at least one body", "Pushes", code="no-bodies")
+    share: Share = 1.0
+    impulse_ns: Annotated[float, Range(0, above=True, infinite=True)] = float("inf")
 
     @property
     def lasting(self) -> tuple[float, float]:

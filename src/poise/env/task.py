@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from poise.env.reference import Reference
 from poise.env.starts import Starts
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
+from poise.settings import Range, validate
 from poise.sim import Backend, SimState
 
 
@@ -98,7 +99,7 @@ class TaskConfig:
     help: HelpSchedule | None = None
     help_by: Literal["all", "clip", "bin"] = "all"
     left: Tensor | None = None
-    filter: float = 0.0
+    filter: Annotated[float, Range(0, 1, below=True)] = 0.0
     window: tuple[int, ...] = ()
     horizon: int = 300
     completion_bonus: float = 0.0
@@ -114,13 +115,7 @@ class TaskConfig:
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.help_by not in ("all", "clip", "bin"):
-            what = f"help is given by 'all', 'clip' or 'bin', got '{self.help_by}'"
-            raise PoiseError(what, "TaskConfig", code="unknown-choice")
-        if not 0 <= self.filter < 1:
-            raise PoiseError(
-                f"filter must lie in 0 to below 1, got {self.filter}", "TaskConfig", code="out-of-range"
-            )
+        validate(self)
         for terms in (self.obs, self.rewards, self.dones):
             names = [t.name for t in terms]
             twice = [n for n in names if names.count(n) > 1]

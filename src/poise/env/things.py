@@ -6,12 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from poise.env.events import Condition, Drawn, Happening
 from poise.errors import PoiseError, did_you_mean
+from poise.settings import Checked, Positive, Range
 from poise.sim import SceneSim
 
 G = 9.81
@@ -69,7 +71,7 @@ class _SetDown(Drawn):
 
 
 @dataclass(frozen=True)
-class Throw:
+class Throw(Checked):
     """A free body that is thrown at another one from all around, again and again.
 
     It flies so that it would hit the body's centre if that kept its velocity.
@@ -86,23 +88,11 @@ class Throw:
 
     name: str
     at: str
-    speed: tuple[float, float] = (2.0, 3.0)
-    distance: float = 1.5
-    every_s: tuple[float, float] = (2.0, 3.0)
+    speed: Annotated[tuple[float, float], Range(0, above=True, rising=True, unit="m/s")] = (2.0, 3.0)
+    distance: Positive = 1.5
+    every_s: Annotated[tuple[float, float], Range(0, above=True, rising=True, unit="s")] = (2.0, 3.0)
     height: tuple[float, float] = (-0.2, 0.2)
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "every_s"):
-            low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise PoiseError(
-                    f"{name} must rise from above 0, got {low:g} to {high:g}", "Throw", code="not-rising"
-                )
-        if not self.distance > 0.0:
-            raise PoiseError(
-                f"distance must be above 0, got {self.distance:g}", "Throw", code="out-of-range"
-            )
 
     def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
         """The event in the worlds of a scene."""

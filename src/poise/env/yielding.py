@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from poise.control.compliance import (
+    LEVEL,
+    STIFFNESS,
     Compliance,
     Stiffness,
-    check_level,
-    check_stiffness,
     columns,
     compliant_rate,
     moving,
@@ -222,9 +222,10 @@ class Yielding(Plugin):
         Raises:
             PoiseError: a level outside of 0 to 1, or a stiffness that is not above 0.
         """
-        check = check_level if isinstance(self.given, Compliance) else check_stiffness
+        compliant = isinstance(self.given, Compliance)
+        allowed, name = (LEVEL, "level") if compliant else (STIFFNESS, "stiffness")
         for value in torch.as_tensor(level, dtype=torch.float64).aminmax():
-            check(float(value))
+            allowed.check(float(value), name)
         self.level[slice(None) if rows is None else rows] = level
 
     def follow(self, goal: Goal) -> None:

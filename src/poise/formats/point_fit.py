@@ -16,6 +16,7 @@ from poise.formats.text import listed
 from poise.motion.clip import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.skeleton import Skeleton, triple
+from poise.settings import Checked, NotNegative, Positive
 
 _LIMBS = {"UpLeg": "hip", "Leg": "knee", "Foot": "ankle", "ToeBase": "toe"}
 _LIMBS |= {"Shoulder": "collar", "Arm": "shoulder", "ForeArm": "elbow", "Hand": "wrist"}
@@ -25,7 +26,7 @@ JOINT_PLACES |= {"Hips": "pelvis", "Neck": "neck", "Head": "head"}
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Checked):
     """How keypoints become a clip.
 
     max_gap_s: the longest gap (s) of a needed keypoint that is interpolated; the recording is cut to its
@@ -35,15 +36,9 @@ class FitConfig:
         (`points.tremble`), and nothing where they have none.
     """
 
-    max_gap_s: float = 0.5
+    max_gap_s: NotNegative = 0.5
     drop_spikes: bool = True
-    smooth_hz: float | None = None
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.max_gap_s) and self.max_gap_s >= 0):
-            raise PoiseError(f"max_gap_s must be at least 0, got {self.max_gap_s}", code="out-of-range")
-        if self.smooth_hz is not None and not (np.isfinite(self.smooth_hz) and self.smooth_hz > 0):
-            raise PoiseError(f"smooth_hz must be above 0, got {self.smooth_hz}", code="out-of-range")
+    smooth_hz: Positive | None = None
 
 
 def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:

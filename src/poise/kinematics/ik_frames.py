@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from poise.errors import PoiseError
 from poise.kinematics.coords import best_path, euler_path, through_lock, wrapped
 from poise.kinematics.ik_body import IkBody, bend_normals, frame_of, held_normals, square_to
 from poise.motion.rotations import best_rotation, normalize
+from poise.settings import Checked, Positive, Range
 
 #: Every correction with what is wrong in the paper. Two more need no switch: the doubled symbols in the
 #: denominators of Eqs. 11 and 12 are misprints of norms, and elbows bend to -z on the left and +z on the
@@ -30,14 +31,14 @@ CORRECTIONS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class IkConfig:
+class IkConfig(Checked):
     """How the paper's equations are read.
 
     faithful: "corrected" or "paper"; what every correction below (see `CORRECTIONS`) takes that is None.
     straight: rad, the bend of a limb below which its bend plane is held. hold_frames: over how long.
     """
 
-    faithful: str = "corrected"
+    faithful: Literal["corrected", "paper"] = "corrected"
     knee_subscripts: bool | None = None
     square_ankle: bool | None = None
     hold_bend: bool | None = None
@@ -45,20 +46,8 @@ class IkConfig:
     trunk_fit: bool | None = None
     thigh_twist: bool | None = None
     branches: bool | None = None
-    straight: float = math.radians(3.0)
-    hold_frames: float = 5.0
-
-    def __post_init__(self) -> None:
-        if self.faithful not in ("corrected", "paper"):
-            raise PoiseError(
-                f"faithful must be corrected or paper, got '{self.faithful}'", code="unknown-choice"
-            )
-        if not (0.0 < self.straight < math.pi / 2 and self.hold_frames > 0.0):
-            raise PoiseError(
-                "straight must lie between 0 and pi / 2 and hold_frames above 0, got "
-                f"{self.straight:g} and {self.hold_frames:g}",
-                code="out-of-range",
-            )
+    straight: Annotated[float, Range(0, math.pi / 2, above=True, below=True)] = math.radians(3.0)
+    hold_frames: Positive = 5.0
 
     def on(self, correction: str) -> bool:
         """Whether one of `CORRECTIONS` is made."""

@@ -28,7 +28,7 @@ from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_
 from poise.learn.protocols import DemoSampler, FeatureSource
 from poise.learn.rollout import TrainingError, check_finite
 from poise.learn.windows import History, WindowBuffer
-from poise.settings import validate
+from poise.settings import Checked, Count, Limit, Positive, Share
 
 
 class Discriminator(nn.Module):
@@ -86,31 +86,31 @@ LEAST = 1e-4  # Of 1 - sigmoid(D): no window is worth more than -log(LEAST) scal
 
 
 @dataclass(frozen=True)
-class AmpConfig:
+class AmpConfig(Checked):
     """Settings of a motion prior; the defaults are for minutes on a CPU, `phc` has the authors'."""
 
-    frames: int = 10
+    frames: Count = 10
     """W, consecutive control steps in a window."""
     hidden: tuple[int, ...] = (256, 128)
     """Widths of the discriminator's hidden layers."""
     activation: str = "relu"
     """relu, silu, gelu, elu or tanh."""
-    clip: float = 5.0
+    clip: Limit = 5.0
     """Normalised features are clipped to +-clip."""
     loss: Loss = "bce"
     """bce as in PHC's code, or least_squares: (D - 1)^2 and (D + 1)^2 with the reward
     max(0, 1 - shape (D - 1)^2) scale, as in the AMP paper."""
-    shape: float = 0.25
+    shape: Positive = 0.25
     """beta of least_squares' reward; Deep Compliant Control has 0.2 for few clips."""
     clamped: bool = True
     """Whether least_squares' reward ends at 0; in Deep Compliant Control it does not."""
-    lr: float = 1e-4
+    lr: Positive = 1e-4
     """Adam's step size."""
-    steps: int = 4
+    steps: Count = 4
     """Gradient steps per iteration."""
-    minibatch: int = 512
+    minibatch: Count = 512
     """Windows of the character per step, as many again from its replay, and as many demos."""
-    kept: int = 2048
+    kept: Count = 2048
     """Windows of the character that are kept of one iteration, drawn at random."""
     gradient_weight: float = 5.0
     """w_gp; the AMP paper writes 10 / 2."""
@@ -124,7 +124,7 @@ class AmpConfig:
     """Demos that are exchanged in the buffer per iteration."""
     replay: int = 4096
     """Windows of the character from earlier iterations that it is still shown; 0 for none."""
-    keep: float = 0.01
+    keep: Share = 0.01
     """Probability with which a window enters the replay once that is full."""
     scale: float = 2.0
     """Of the style reward; the AMP paper has 1."""
@@ -134,24 +134,6 @@ class AmpConfig:
     """w_style."""
     product: bool = False
     """r = r_task r_style in place of the weighted sum (Deep Compliant Control, Eq. 11)."""
-
-    def __post_init__(self) -> None:
-        validate(self)
-        for name in ("frames", "lr", "steps", "minibatch", "kept"):
-            if not getattr(self, name) > 0:
-                raise PoiseError(
-                    f"{name} must be above 0, got {getattr(self, name)}",
-                    "AmpConfig",
-                    code="out-of-range",
-                )
-        if not self.shape > 0:
-            raise PoiseError(
-                f"shape must be above 0, got {self.shape:g}", "AmpConfig", code="out-of-range"
-            )
-        if not 0 <= self.keep <= 1:
-            raise PoiseError(
-                f"keep must lie in [0, 1], got {self.keep}", "AmpConfig", code="out-of-range"
-            )
 
     @classmethod
     def compliant(cls, few: bool = True, product: bool = True) -> AmpConfig:

@@ -24,6 +24,7 @@ from poise.motion.rotations import (
     sixd_to_matrix,
 )
 from poise.motion.rotations import slerp as arc
+from poise.settings import Count, validate
 
 _MIN_STD = 0.02
 #: Of steps from frame to frame.
@@ -37,9 +38,9 @@ _CARRIED = 8.0
 class BetweenConfig:
     """Sizes of the transformer; the defaults have about 5 million weights."""
 
-    width: int = 256
-    layers: int = 6
-    heads: int = 8
+    width: Count = 256
+    layers: Count = 6
+    heads: Count = 8
     feedforward: int = 1024
     refine: int = 0
     """Layers of the refining encoder; 0 leaves it out."""
@@ -51,7 +52,8 @@ class BetweenConfig:
     """Whether interpolation goes on in the speed around it and frames are seen with their speeds."""
 
     def __post_init__(self) -> None:
-        if self.width % self.heads or min(self.width, self.layers, self.heads) < 1:
+        validate(self)
+        if self.width % self.heads:
             raise PoiseError(
                 f"width must be a multiple of heads, got {self.width} and {self.heads}",
                 "BetweenConfig",

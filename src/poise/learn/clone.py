@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from poise.errors import PoiseError
 from poise.learn.checkpoint import (
     State,
     load_optimizer_state,
@@ -25,54 +25,33 @@ from poise.learn.ppo import PPO, PPOConfig
 from poise.learn.protocols import Lessons, Teacher, VecEnv
 from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.machine import one_thread
-from poise.settings import validate
+from poise.settings import Checked, Count, Length, Positive, Range, Share
 
 
 @dataclass(frozen=True)
-class CloneConfig:
+class CloneConfig(Checked):
     """Settings of cloning; the defaults take half a minute on two cores with 512 environments."""
 
-    steps: int = 56
+    steps: Count = 56
     """Control steps per environment and round."""
-    rounds: int = 3
+    rounds: Annotated[int, Range(0)] = 3
     """DAgger rounds after the teacher's own."""
-    beta: float = 0.3
+    beta: Share = 0.3
     """Share of the episodes of round k that the teacher drives: beta^k, so all of them in round 0."""
-    noise: tuple[float, ...] = (0.0, 1.0, 2.0)
+    noise: Annotated[tuple[float, ...], Range(0), Length(1)] = (0.0, 1.0, 2.0)
     """Exploration of the teacher's episodes in units of the policy's action noise; every
     environment keeps one of these levels through a round. The student explores with 1."""
     epochs: tuple[int, int] = (6, 4)
     """Passes over all data after round 0 and after each later one."""
-    minibatch: int = 2048
-    most: int = 0
+    minibatch: Count = 2048
+    most: Annotated[int, Range(0)] = 0
     """A pass takes so many samples of all at most, drawn anew; 0 takes all."""
-    lr: float = 1e-3
+    lr: Positive = 1e-3
     """Adam's step size; it falls to a tenth over each round's fit."""
-    critic_steps: int = 32
+    critic_steps: Annotated[int, Range(0)] = 32
     """Control steps per environment that teach the critic by their returns; 0 leaves it untrained."""
     critic_passes: int = 3
     """Times that the critic learns from them, with returns estimated anew."""
-
-    def __post_init__(self) -> None:
-        for name, least in (
-            ("steps", 1),
-            ("rounds", 0),
-            ("minibatch", 1),
-            ("most", 0),
-            ("critic_steps", 0),
-        ):
-            if getattr(self, name) < least:
-                raise PoiseError(
-                    f"{name} must be at least {least}, got {getattr(self, name)}",
-                    "CloneConfig",
-                    code="out-of-range",
-                )
-        if not 0 <= self.beta <= 1 or not self.noise or min(self.noise) < 0 or self.lr <= 0:
-            raise PoiseError(
-                "beta must lie in [0, 1], lr above 0, and noise needs levels of at least 0",
-                "CloneConfig",
-                code="out-of-range",
-            )
 
 
 @dataclass(frozen=True)
@@ -262,27 +241,21 @@ def _fit_critic(env: VecEnv, learner: PPO, config: CloneConfig, obs: Tensor, see
 
 
 @dataclass(frozen=True)
-class LessonConfig:
+class LessonConfig(Checked):
     """How labels are learned."""
 
-    kept: int = 40_000
+    kept: Count = 40_000
     """Labels that are kept, the newest ones."""
-    batches: int = 8
+    batches: Count = 8
     """Steps of Adam in an iteration."""
-    batch: int = 1024
+    batch: Count = 1024
     """Labels of each."""
-    lr: float = 5e-5
+    lr: Positive = 5e-5
     """Adam's step size."""
-    grad_norm: float = 1.0
+    grad_norm: Annotated[float, Range(0, above=True, infinite=True)] = 1.0
     """Gradients are scaled down to this norm."""
     reinforce: bool = False
     """Whether PPO trains the policy, too; without, it trains the critic alone."""
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if min(self.kept, self.batches, self.batch) < 1 or min(self.lr, self.grad_norm) <= 0:
-            what = "kept, batches and batch must be at least 1, lr and grad_norm above 0"
-            raise PoiseError(what, "LessonConfig", code="out-of-range")
 
 
 class Student:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
 from poise.learn.networks import MLP, bare_linear, bfloat16_is_fast, product
-from poise.settings import validate
+from poise.settings import Checked, Count, Positive, Range
 
 _MIN_STD = 1e-3
 
 
 @dataclass(frozen=True)
-class CVAEConfig:
+class CVAEConfig(Checked):
     """Sizes; widths of the layers stand in a picture that the paper's text does not give, and are ours.
 
     Attributes:
@@ -33,22 +33,14 @@ class CVAEConfig:
         blocks: of "cosine", pairs of layers.
     """
 
-    past: int = 30
-    future: int = 60
-    latent: int = 128
-    hidden: int = 256
-    layers: tuple[int, ...] = (256,)
+    past: Annotated[int, Range(2, unit="frames")] = 30
+    future: Count = 60
+    latent: Count = 128
+    hidden: Count = 256
+    layers: Annotated[tuple[int, ...], Range(1)] = (256,)
     decoder: Literal["recurrent", "cosine"] = "recurrent"
-    cosines: int = 24
-    blocks: int = 2
-
-    def __post_init__(self) -> None:
-        validate(self)
-        sizes = (self.past, self.future, self.latent, self.hidden, self.cosines, self.blocks)
-        if min(*sizes, *self.layers) < 1 or self.past < 2:
-            raise PoiseError(
-                "every size must be at least 1, and the past 2 frames", "CVAEConfig", code="out-of-range"
-            )
+    cosines: Count = 24
+    blocks: Count = 2
 
 
 class Code(NamedTuple):
@@ -308,7 +300,7 @@ FAR = 8.0
 
 
 @dataclass(frozen=True)
-class CVAETraining:
+class CVAETraining(Checked):
     """How it is trained; `paper` has the values that the paper states.
 
     Attributes:
@@ -331,30 +323,20 @@ class CVAETraining:
         products: how matrices are multiplied; weights and losses are float32 in any case.
     """
 
-    batch: int = 128
-    lr: float = 5e-4
+    batch: Count = 128
+    lr: Positive = 5e-4
     held: float = 0.5
-    beta: float = 10.0
+    beta: Positive = 10.0
     tolerance: float = 20.0
     smooth: float = 10.0
     own_past: float = 0.7
-    segments: int = 3
+    segments: Count = 3
     shorter: bool = False
     noise: float = 0.05
     mix: float = 0.4
-    settle: float = 5.0
-    grad_norm: float = 1.0
+    settle: Positive = 5.0
+    grad_norm: Annotated[float, Range(0, above=True, infinite=True)] = 1.0
     products: Literal["auto", "float32", "bfloat16"] = "auto"
-
-    def __post_init__(self) -> None:
-        validate(self)
-        above = (self.batch, self.lr, self.beta, self.settle, self.segments, self.grad_norm)
-        if min(above) <= 0:
-            raise PoiseError(
-                "batch, lr, beta, settle, segments and grad_norm must be above 0",
-                "CVAETraining",
-                code="out-of-range",
-            )
 
     @classmethod
     def paper(cls) -> CVAETraining:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, cast
+from typing import Annotated, Any, Literal, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -38,7 +38,7 @@ from poise.learn.rollout import TrainingError
 from poise.learn.rtn import RTN, RTNConfig
 from poise.learn.run import Log, interruptible
 from poise.learn.transition import Filled, Known, Layout, TransitionNet, joint_positions
-from poise.settings import check_data, from_data, validate
+from poise.settings import Checked, Count, NotNegative, Positive, Range, check_data, from_data
 
 #: Times that saving takes, which pass until the next checkpoint at least.
 _SAVING = 20.0
@@ -403,32 +403,24 @@ N = TypeVar("N", bound=nn.Module)
 
 
 @dataclass(frozen=True)
-class Adaptation:
+class Adaptation(Checked):
     """How a network is adapted to what it is asked."""
 
-    iterations: int = 5
+    iterations: Annotated[int, Range(0)] = 5
     """Passes over the test set, or over one sequence; choose them on validation."""
     steps: Literal["whole", "minibatch"] = "whole"
     """whole: one step of each pass, down the mean loss of all sequences. minibatch: a step after each
     `batch` of them, as the paper's "several epochs on the whole test data" reads."""
-    lr: float = 1e-5
-    beta: float = 0.01
+    lr: Positive = 1e-5
+    beta: NotNegative = 0.01
     """Weight of the root's path."""
     contacts: Literal["detached", "paper"] = "detached"
     """detached: predicted contacts only weigh. paper: gradients flow through them as Eq. 1 is written,
     so that predicting no contact at all also lowers the loss."""
     optimizer: Literal["sgd", "adam"] = "adam"
-    batch: int = 128
+    batch: Count = 128
     """Sequences of which gradients are computed at once; with `steps="whole"` it changes memory and time
     alone."""
-
-    def __post_init__(self) -> None:
-        if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
-            raise PoiseError(
-                f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}",
-                code="out-of-range",
-            )
-        validate(self)
 
 
 def contact_loss(feet: Tensor, contact: Tensor) -> Tensor:

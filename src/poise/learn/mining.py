@@ -18,7 +18,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import State, take
-from poise.settings import validate
+from poise.settings import Count, Share, validate
 
 Rule = Literal["uniform", "soft", "hard", "floor"]
 Union = Literal["recent", "last"]
@@ -37,11 +37,11 @@ class MiningConfig:
     floor: `floor` b_i + (1 - floor) e_i, where e_i is the share of failures of which old ones fade by
     `fade` per evaluation: every clip is drawn, and a clip that has been learned is left in peace.
     """
-    floor: float = 0.3
+    floor: Share = 0.3
     """Share of the draws that are made as without mining."""
-    fade: float = 0.7
+    fade: Share = 0.7
     """What an evaluation leaves of earlier failures with "floor"; 1 forgets none."""
-    memory: int = 5
+    memory: Count = 5
     """With the union "recent", clips that failed in so many last evaluations are the next
     primitive's."""
     union: Union = "recent"
@@ -50,23 +50,12 @@ class MiningConfig:
 
     def __post_init__(self) -> None:
         validate(self)
-        for name in ("floor", "fade"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise PoiseError(
-                    f"{name} must lie in [0, 1], got {getattr(self, name)}",
-                    "MiningConfig",
-                    code="out-of-range",
-                )
         if self.rule == "floor" and self.floor == 0:
             raise PoiseError(
                 "a floor of 0 is the rule soft",
                 "MiningConfig",
                 "Use soft, or a floor",
                 code="settings-conflict",
-            )
-        if self.memory < 1:
-            raise PoiseError(
-                f"memory must be at least 1, got {self.memory}", "MiningConfig", code="out-of-range"
             )
 
     @classmethod
@@ -205,18 +194,20 @@ Decision = Literal["go on", "next", "solved"]
 class ConvergenceConfig:
     """When to stop a stage, in evaluations of its clips."""
 
-    patience: int = 3
+    patience: Count = 3
     """Evaluations in a row without a gain after which the stage ends."""
     gain: float = 0.0
     """An improvement is a success rate above the best so far by more than this."""
-    least: int = 1
+    least: Count = 1
     """Evaluations that a stage gets in any case, unless it is solved."""
-    most: int | None = None
+    most: Count | None = None
     """Evaluations after which it ends in any case."""
 
     def __post_init__(self) -> None:
-        if self.patience < 1 or self.least < 1 or (self.most is not None and self.most < self.least):
-            raise PoiseError(f"a stage cannot end by {self}", "ConvergenceConfig", code="out-of-range")
+        validate(self)
+        if self.most is not None and self.most < self.least:
+            what = f"most must be at least least, {self.least}, got {self.most}"
+            raise PoiseError(what, "ConvergenceConfig", code="out-of-range")
 
 
 class Convergence:

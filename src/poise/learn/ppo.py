@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -44,32 +44,32 @@ from poise.learn.parallel import (
 )
 from poise.learn.policy import PolicyBundle
 from poise.learn.rollout import Rollout, TrainingError
-from poise.settings import validate
+from poise.settings import Count, Limit, NotNegative, Positive, Range, Share, validate
 
 
 @dataclass(frozen=True)
 class PPOConfig:
     """Settings of PPO (Schulman et al. 2017); the defaults are for minutes on a CPU."""
 
-    horizon: int = 16
+    horizon: Count = 16
     """Control steps per environment and iteration; the batch is horizon x num_envs samples."""
-    epochs: int = 5
+    epochs: Count = 5
     """Passes over the batch in one update."""
-    minibatch: int = 2048
+    minibatch: Count = 2048
     """Samples per gradient step; the batch is cut into parts of nearly this size."""
-    gamma: float = 0.95
+    gamma: Share = 0.95
     """Discount per control step."""
-    lam: float = 0.95
+    lam: Share = 0.95
     """Lambda of the generalised advantage estimation."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """The probability ratio counts only inside [1 - clip, 1 + clip]."""
-    policy_lr: float = 2e-4
+    policy_lr: Positive = 2e-4
     """Adam's step size for the policy: 2e-4 from scratch, 1e-4 after a warm start."""
-    value_lr: float = 5e-4
+    value_lr: Positive = 5e-4
     """Adam's step size for the critic."""
-    policy_grad_norm: float | None = 40.0
+    policy_grad_norm: Limit | None = 40.0
     """The policy's gradient is scaled down to this norm; None leaves it."""
-    value_grad_norm: float | None = None
+    value_grad_norm: Limit | None = None
     """The same for the critic."""
     policy_hidden: tuple[int, ...] = (256, 128)
     """Widths of the policy's hidden layers."""
@@ -85,23 +85,23 @@ class PPOConfig:
     """Weight of the entropy bonus; it matters only with a learned deviation."""
     bound_weight: float = 0.0
     """Weight of the squared excess of the mean action over +-bound_limit."""
-    bound_limit: float = 1.0
+    bound_limit: Limit = 1.0
     """Mean actions inside +-bound_limit cost nothing."""
-    smooth_weight: float = 0.0
+    smooth_weight: NotNegative = 0.0
     """Weight of KL(pi(s) || pi(s + n)), with n of `smooth_noise`: what makes the policy answer alike to
     states that are near (Shen et al. 2020, "Deep RL with robust and smooth policy")."""
-    smooth_noise: float = 0.8
+    smooth_noise: NotNegative = 0.8
     """Deviation of n in normalised observations."""
-    smooth_over: tuple[int, int] | None = None
+    smooth_over: Annotated[tuple[int, int], Range(0)] | None = None
     """First column of the observations in which n is not 0, and the first after them; None: a recipe
     that knows better says which, else all."""
-    kl_target: float | None = None
+    kl_target: Limit | None = None
     """With a number, the policy's lr follows the KL per update (summed over the actions): divided
     by 1.5 above twice the target, multiplied by 1.5 below half of it. Use 0.03 to 0.1: with 38
     actions a target of 0.01 drives the lr to its floor at once and nothing is learned."""
-    lr_range: tuple[float, float] = (1e-5, 1e-3)
+    lr_range: Annotated[tuple[float, float], Range(0, above=True, rising=True)] = (1e-5, 1e-3)
     """Bounds of the adaptive lr."""
-    kl_stop: float | None = 1.0
+    kl_stop: Limit | None = 1.0
     """The remaining epochs train only the critic once an epoch's mean KL exceeds this. Healthy
     updates stay under 0.1; a step that destroys the policy reaches 10."""
     critic_warmup: int = 0
@@ -113,7 +113,7 @@ class PPOConfig:
     float32 gives the same numbers on processors with and without."""
     normalise_returns: bool = True
     """The critic learns returns scaled to mean 0 and deviation 1 (PopArt, van Hasselt 2016)."""
-    obs_clip: float = 5.0
+    obs_clip: Limit = 5.0
     """Normalised observations are clipped to +-obs_clip."""
     norm_warmup: int = 16
     """Control steps before the first iteration that only gather the statistics of observations;
@@ -124,36 +124,9 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         validate(self)
-        for name in ("horizon", "epochs", "minibatch", "policy_lr", "value_lr", "clip"):
-            if not getattr(self, name) > 0:
-                raise PoiseError(
-                    f"{name} must be above 0, got {getattr(self, name)}",
-                    "PPOConfig",
-                    code="out-of-range",
-                )
-        for name in ("smooth_weight", "smooth_noise"):
-            if not getattr(self, name) >= 0:
-                raise PoiseError(
-                    f"{name} must be at least 0, got {getattr(self, name)}",
-                    "PPOConfig",
-                    code="out-of-range",
-                )
-        if self.smooth_over is not None and not 0 <= self.smooth_over[0] < self.smooth_over[1]:
+        if self.smooth_over is not None and self.smooth_over[0] >= self.smooth_over[1]:
             raise PoiseError(
                 f"smooth_over must be (from, to), got {self.smooth_over}", "PPOConfig", code="not-rising"
-            )
-        for name in ("gamma", "lam"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise PoiseError(
-                    f"{name} must lie in [0, 1], got {getattr(self, name)}",
-                    "PPOConfig",
-                    code="out-of-range",
-                )
-        if not 0 < self.lr_range[0] <= self.lr_range[1]:
-            raise PoiseError(
-                f"lr_range must be (low, high) above 0, got {self.lr_range}",
-                "PPOConfig",
-                code="out-of-range",
             )
 
     def check_columns(self, num_obs: int) -> None:

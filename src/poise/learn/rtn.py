@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, cast
+from typing import Annotated, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from poise.errors import PoiseError
 from poise.learn.between import linear, schedule
 from poise.learn.networks import bfloat16_is_fast
 from poise.learn.transition import (
@@ -25,28 +24,25 @@ from poise.learn.transition import (
 )
 from poise.learn.windows import Sampler, Windows
 from poise.motion.rotations import normalize
+from poise.settings import Checked, Count, Range
 
 #: Squared step in m^2 under which a foot joint of the past counts as in contact (0.02 cm^2).
 _CONTACT = 2e-6
 
 
 @dataclass(frozen=True)
-class RTNConfig:
+class RTNConfig(Checked):
     """Sizes of the recurrent network."""
 
-    hidden: int = 512
+    hidden: Count = 512
     """Width of the LSTM; no source states it, public codes have 512 and 768."""
-    encoder: tuple[int, int] = (512, 256)
-    decoder: tuple[int, int] = (512, 256)
-    past: int = 10
-    longest: int = 30
+    encoder: Annotated[tuple[int, int], Range(1)] = (512, 256)
+    decoder: Annotated[tuple[int, int], Range(1)] = (512, 256)
+    past: Count = 10
+    longest: Count = 30
     """P_max, the longest transition trained; times to arrival are clamped at past + P_max - 5."""
     noise: float = 0.5
     """Deviation of the target noise."""
-
-    def __post_init__(self) -> None:
-        if min(self.hidden, *self.encoder, *self.decoder, self.past, self.longest) < 1:
-            raise PoiseError("every size must be at least 1", "RTNConfig", code="out-of-range")
 
     @property
     def latest(self) -> int:

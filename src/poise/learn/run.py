@@ -14,13 +14,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import LAST_GOOD, LATEST, remove_partial, write_atomic
 from poise.learn.parallel import any_of, together
 from poise.learn.rollout import TrainingError
 from poise.learn.train import IterationStats, Trainer
+from poise.settings import Range, validate
 
 CSV_NAME = "log.csv"
 TENSORBOARD_NAME = "tensorboard"
@@ -135,17 +136,18 @@ class _Events:
 class Until:
     """When to stop: at the first limit reached, counted over all resumed runs."""
 
-    minutes: float | None = None
+    minutes: Annotated[float, Range(0, infinite=True)] | None = None
     """Training time; evaluation and checkpoints do not count."""
-    iterations: int | None = None
-    samples: int | None = None
+    iterations: Annotated[int, Range(0)] | None = None
+    samples: Annotated[int, Range(0)] | None = None
 
     def __post_init__(self) -> None:
-        limits = [x for x in (self.minutes, self.iterations, self.samples) if x is not None]
-        if not limits or min(limits) < 0:
+        validate(self)
+        if self.minutes is self.iterations is self.samples is None:
             raise PoiseError(
-                f"training needs a limit, got {self}",
-                hint="Give minutes, iterations or samples",
+                "training needs a limit",
+                "Until",
+                "Give minutes, iterations or samples",
                 code="limit-missing",
             )
 

@@ -8,14 +8,14 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from poise.errors import PoiseError
 from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
-from poise.settings import validate
+from poise.settings import Range, Share, validate
 
 #: Version of the protocol; bytes and depth of a message; joints of a skeleton.
 VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
@@ -240,30 +240,14 @@ class LiveConfig:
         seed: of the noise and of lookahead.
     """
 
-    characters: int = 1
-    buffer_s: float = 0.1
-    lookahead: int = 0
-    noise: float = 0.0
+    characters: Annotated[int, Range(1, 16)] = 1
+    buffer_s: Annotated[float, Range(0, 0.4, unit="s")] = 0.1
+    lookahead: Annotated[int, Range(0)] = 0
+    noise: Share = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         validate(self)
-        if not 1 <= self.characters <= 16:
-            raise PoiseError(
-                f"characters must lie in 1 to 16, got {self.characters}",
-                "LiveConfig",
-                code="out-of-range",
-            )
-        if not 0 <= self.buffer_s <= 0.4:
-            raise PoiseError(
-                f"buffer_s must lie in 0 to 0.4 s, got {self.buffer_s:g}",
-                "LiveConfig",
-                code="out-of-range",
-            )
-        if not 0 <= self.lookahead <= self.characters:
+        if self.lookahead > self.characters:
             what = f"lookahead must lie in 0 to {self.characters} characters, got {self.lookahead}"
             raise PoiseError(what, "LiveConfig", code="out-of-range")
-        if not 0 <= self.noise <= 1:
-            raise PoiseError(
-                f"noise must lie in 0 to 1, got {self.noise:g}", "LiveConfig", code="out-of-range"
-            )

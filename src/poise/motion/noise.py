@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
+from poise.settings import Checked, NotNegative, Range
 
 _LEG_WORDS = ("hip", "leg", "thigh", "femur", "knee", "tibia", "shin", "ankle", "foot", "heel", "toe")
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"))
@@ -36,27 +37,15 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noise:
+class Noise(Checked):
     """One kind of error of an estimator.
 
     strength: 1 is as the docstring of the kind says, 0 changes nothing. seed: the same seed makes the
     same noise; another strength makes the same one at another size, so that curves over it are smooth.
     """
 
-    strength: float = 1.0
+    strength: NotNegative = 1.0
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            numbers = value if isinstance(value, tuple) else (value,)
-            bad = [v for v in numbers if isinstance(v, int | float) and not math.isfinite(v)]
-            if bad or (
-                name not in ("axis", "camera", "bias") and any(v < 0 for v in numbers if v is not None)
-            ):
-                raise PoiseError(
-                    f"{name} of {type(self).__name__} must not be negative, got {value}",
-                    code="out-of-range",
-                )
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         """What is seen with this noise."""
@@ -162,11 +151,11 @@ class Jitter(Noise):
     forearm and hand).
     """
 
-    sigma_m: float = 0.02
-    sigma_rad: float = 0.05
-    tau_s: float = 0.06
+    sigma_m: NotNegative = 0.02
+    sigma_rad: NotNegative = 0.05
+    tau_s: NotNegative = 0.06
     axis: Vector = (1.0, 0.0, 0.0)
-    axis_ratio: float = 1.0
+    axis_ratio: NotNegative = 1.0
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         way, frames = _unit(self.axis), len(seen.pos)
@@ -186,9 +175,9 @@ class Outliers(Noise):
     On a pose a joint turns by `size_rad` instead. Strength scales the share.
     """
 
-    share: float = 0.16
-    size_m: float = 0.035
-    size_rad: float = 0.1
+    share: NotNegative = 0.16
+    size_m: NotNegative = 0.035
+    size_rad: NotNegative = 0.1
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         size, shape = (self.size_m, seen.pos.shape[:2])
@@ -205,8 +194,8 @@ class Outliers(Noise):
 class Drift(Noise):
     """The whole body wanders by `sigma_m` m along x, y and z, with a memory of `tau_s` s."""
 
-    sigma_m: Vector = (0.045, 0.045, 0.045)
-    tau_s: float = 0.8
+    sigma_m: Annotated[Vector, Range(0)] = (0.045, 0.045, 0.045)
+    tau_s: NotNegative = 0.8
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         path = wandering_path(rng, len(seen.pos), (3,), seen.fps, self.tau_s)
@@ -221,9 +210,9 @@ class WrongDepth(Noise):
     4 m in front of where the body begins, looking along `axis` a. On a pose it moves the root.
     """
 
-    sigma: float = 0.03
+    sigma: NotNegative = 0.03
     bias: float = 0.0
-    tau_s: float = 0.5
+    tau_s: NotNegative = 0.5
     axis: Vector = (1.0, 0.0, 0.0)
     camera: Vector | None = None
 
@@ -244,8 +233,8 @@ class WrongDepth(Noise):
 class Dropouts(Noise):
     """Points are missing for `share` of the time each, in spells of `mean_s` s on average."""
 
-    share: float = 0.04
-    mean_s: float = 0.19
+    share: NotNegative = 0.04
+    mean_s: NotNegative = 0.19
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         if seen.rot is None:
@@ -264,8 +253,8 @@ class Dropouts(Noise):
 class FrameLoss(Dropouts):
     """Whole frames are missing for `share` of the time, in spells of `mean_s` s on average."""
 
-    share: float = 0.03
-    mean_s: float = 0.1
+    share: NotNegative = 0.03
+    mean_s: NotNegative = 0.1
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         lost = self._lost(rng, seen, 1)
@@ -279,8 +268,8 @@ class FrameLoss(Dropouts):
 class SwapSides(Noise):
     """Left is taken for right for `share` of the time, in spells of `mean_s` s, arms and legs apart."""
 
-    share: float = 0.02
-    mean_s: float = 0.15
+    share: NotNegative = 0.02
+    mean_s: NotNegative = 0.15
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         values = seen.pos if seen.rot is None else seen.rot
@@ -297,7 +286,7 @@ class SwapSides(Noise):
 class Latency(Noise):
     """Everything comes `seconds` s late, between frames by interpolation; before, the first frame."""
 
-    seconds: float = 0.1
+    seconds: NotNegative = 0.1
 
     def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
         del rng

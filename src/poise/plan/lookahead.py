@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from poise.metrics import has_lost
 from poise.metrics.plausibility import foot_contacts, jerk
 from poise.metrics.shapes import Shapes, foot_points
 from poise.plan.sampling import draw_offsets
+from poise.settings import Count, Length, NotNegative, Range, Share, validate
 
 #: m/s^3, the mean jerk below which a reference counts as calm.
 CALM = 50.0
@@ -229,19 +230,22 @@ class LookaheadConfig:
 
     candidates: int = 64
     horizon: int = 12
-    hold_steps: int = 4
-    noise_range: tuple[float, float] = (0.03, 0.3)
-    warm: float = 0.5
-    smoothing: tuple[float, ...] = (0.0, 0.5, 0.7, 0.9, 0.97)
-    corrections: tuple[float, ...] = (1.0, 0.7, 0.4, 0.1)
-    jerk_price: float = 0.5
-    slide_price: float = 12.0
-    slack: float = 1.5
-    strict_m: float = 0.25
-    discount: float = 0.97
+    hold_steps: Count = 4
+    noise_range: Annotated[tuple[float, float], Range(0, above=True, rising=True)] = (0.03, 0.3)
+    warm: Share = 0.5
+    smoothing: Annotated[tuple[float, ...], Range(0, 1, below=True), Length(1)] = (
+        0.0, 0.5, 0.7, 0.9, 0.97
+    )  # fmt: skip
+    corrections: Annotated[tuple[float, ...], Range(0, 1)] = (1.0, 0.7, 0.4, 0.1)
+    jerk_price: NotNegative = 0.5
+    slide_price: NotNegative = 12.0
+    slack: NotNegative = 1.5
+    strict_m: Annotated[float, Range(0, above=True, infinite=True)] = 0.25
+    discount: Annotated[float, Range(0, 1, above=True)] = 0.97
     seed: int = 0
 
     def __post_init__(self) -> None:
+        validate(self)
         if self.candidates < max(FEWEST, 2 * len(self.smoothing)):
             least = max(FEWEST, 2 * len(self.smoothing))
             what = f"lookahead needs at least {least} candidates, got {self.candidates}"
@@ -249,21 +253,11 @@ class LookaheadConfig:
             raise PoiseError(
                 what, hint=f"Give a budget of {steps:g} simulated steps or more", code="budget-too-small"
             )
-        if not 1 <= self.hold_steps <= self.horizon:
+        if self.hold_steps > self.horizon:
             what = f"hold_steps must lie in 1 to the horizon {self.horizon}, got {self.hold_steps}"
             raise PoiseError(what, "LookaheadConfig", code="out-of-range")
-        low, high = self.noise_range
-        if not 0 < low <= high or not 0 < self.discount <= 1 or not 0 <= self.warm <= 1:
-            what = "noise_range must rise from above 0, discount and warm must lie in 0 to 1"
-            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
-        if not self.smoothing or not all(0 <= s < 1 for s in self.smoothing):
-            what = f"shares of smoothing must lie in 0 to below 1, got {self.smoothing}"
-            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
-        if self.corrections[:1] != (1.0,) or not all(0 <= c <= 1 for c in self.corrections):
-            what = f"corrections must begin with 1 and lie in 0 to 1, got {self.corrections}"
-            raise PoiseError(what, "LookaheadConfig", code="out-of-range")
-        if min(self.jerk_price, self.slide_price, self.slack) < 0 or self.strict_m <= 0:
-            what = "prices and slack must be at least 0, strict_m above"
+        if self.corrections[:1] != (1.0,):
+            what = f"corrections must begin with 1, got {self.corrections}"
             raise PoiseError(what, "LookaheadConfig", code="out-of-range")
 
     @property

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.machine import one_thread
 from poise.metrics import has_lost, mpjpe_global
+from poise.settings import Count, Range, validate
 
 
 @dataclass(frozen=True)
@@ -44,29 +46,23 @@ class SamplingConfig:
     """
 
     characters: int = 512
-    samples_per_state: int = 4
-    hold_steps: int = 4
-    noise_range: tuple[float, float] = (0.03, 0.3)
+    samples_per_state: Annotated[int, Range(2)] = 4
+    hold_steps: Count = 4
+    noise_range: Annotated[tuple[float, float], Range(0, above=True, rising=True)] = (0.03, 0.3)
     memory: float = 0.7
     distance: float = 2.0
-    rounds: int = 1
-    retries: int = 8
-    back: int = 5
+    rounds: Count = 1
+    retries: Annotated[int, Range(0)] = 8
+    back: Count = 5
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.samples_per_state < 2 or self.characters < 2 * self.samples_per_state:
+        validate(self)
+        if self.characters < 2 * self.samples_per_state:
             what = f"got {self.characters} characters, {self.samples_per_state} from each state"
             raise PoiseError(
                 what, "SamplingConfig", "Take 8 or more, 2 or more from each", code="out-of-range"
             )
-        counts, spread = (
-            (self.hold_steps, self.rounds, self.back),
-            0 < self.noise_range[0] <= self.noise_range[1],
-        )
-        if min(counts) < 1 or self.retries < 0 or not spread:
-            what = "hold_steps, rounds, back and noise_range must be positive, and noise_range must rise"
-            raise PoiseError(what, "SamplingConfig", code="out-of-range")
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.plan.lookahead import PAST, Candidates, Changes
 from poise.plan.sampling import draw_offsets
-from poise.settings import validate
+from poise.settings import Count, NotNegative, Range, Share, validate
 
 
 @dataclass(frozen=True)
@@ -45,35 +46,26 @@ class TeacherConfig:
         discount: gamma.
     """
 
-    worlds: int = 16
+    worlds: Count = 16
     candidates: int = 32
     horizon: int = 8
-    hold_steps: int = 4
-    best: int = 6
-    decisions: int = 16
-    noise_range: tuple[float, float] = (0.02, 0.2)
-    jerk_price: float = 0.03
-    slide_price: float = 2.0
-    own: float = 0.5
-    discount: float = 0.97
+    hold_steps: Count = 4
+    best: Count = 6
+    decisions: Count = 16
+    noise_range: Annotated[tuple[float, float], Range(0, above=True, rising=True)] = (0.02, 0.2)
+    jerk_price: NotNegative = 0.03
+    slide_price: NotNegative = 2.0
+    own: Share = 0.5
+    discount: Annotated[float, Range(0, 1, above=True)] = 0.97
 
     def __post_init__(self) -> None:
         validate(self)
-        if min(self.worlds, self.decisions) < 1 or not 1 <= self.best < self.candidates:
-            what = (
-                f"worlds and decisions must be at least 1 and fewer best than candidates, got "
-                f"{self.worlds}, {self.decisions}, {self.best} of {self.candidates}"
-            )
+        if self.best >= self.candidates:
+            what = f"best must be fewer than candidates, got {self.best} of {self.candidates}"
             raise PoiseError(what, "TeacherConfig", code="out-of-range")
-        if not 1 <= self.hold_steps <= self.horizon:
+        if self.hold_steps > self.horizon:
             what = f"hold_steps must lie in 1 to the horizon {self.horizon}, got {self.hold_steps}"
             raise PoiseError(what, "TeacherConfig", code="out-of-range")
-        low, high = self.noise_range
-        if not 0 < low <= high or not 0 < self.discount <= 1 or not 0 <= self.own <= 1:
-            what = "noise_range must rise from above 0, discount and own must lie in 0 to 1"
-            raise PoiseError(what, "TeacherConfig", code="out-of-range")
-        if min(self.jerk_price, self.slide_price) < 0:
-            raise PoiseError("prices must be at least 0", "TeacherConfig", code="out-of-range")
 
 
 class LookaheadTeacher:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Annotated
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.plan.expert import ExpertConfig, make_plan
 from poise.plan.lqr import Regulator, driven, linearise, regulate
+from poise.settings import Limit, Positive, Range, validate
 from poise.sim import CpuBackend, SimConfig, alone, difference
 
 
@@ -52,9 +54,9 @@ class TrajOptConfig:
         plan: the scripted expert with which it begins.
     """
 
-    iterations: int = 11
-    sizes: tuple[float, float] = (0.1, 0.065)
-    segment_s: float = 2.0
+    iterations: Annotated[int, Range(0)] = 11
+    sizes: Annotated[tuple[float, float], Range(0, above=True)] = (0.1, 0.065)
+    segment_s: Positive = 2.0
     place_m: float = 0.3
     turn: float = 0.4
     joint: float = 0.5
@@ -64,20 +66,18 @@ class TrajOptConfig:
     effort: float = 0.5
     help_n: float = 100.0
     help_nm: float = 30.0
-    less: float = 0.6
+    less: Annotated[float, Range(0, 1, above=True, below=True)] = 0.6
     least: float = 0.02
     good: float = 4.0
-    bad: float = 10.0
-    astray: float = 25.0
+    bad: Limit = 10.0
+    astray: Limit = 25.0
     steps: tuple[float, ...] = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
-    lost: float = 1.2
+    lost: Limit = 1.2
     blur: int = 3
     plan: ExpertConfig = field(default_factory=ExpertConfig)
 
     def __post_init__(self) -> None:
-        if self.iterations < 0 or not 0 < self.less < 1 or min(*self.sizes, self.segment_s) <= 0:
-            what = "iterations must not be negative, less lie in (0, 1), sizes and segment_s be above 0"
-            raise PoiseError(what, "TrajOptConfig", code="out-of-range")
+        validate(self)
         if 0.0 not in self.steps:
             raise PoiseError(
                 "one of the steps must be 0, with which a trajectory stays",

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
@@ -20,7 +20,18 @@ from poise.learn import (
 )
 from poise.plan import TeacherConfig, TrajOptConfig
 from poise.recipes.shapes import BodyShapes
-from poise.settings import Migration, from_data, validate
+from poise.settings import (
+    Checked,
+    Count,
+    Length,
+    Limit,
+    Migration,
+    NotNegative,
+    Range,
+    Share,
+    from_data,
+    validate,
+)
 from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped, so that lying is told from leaning.
@@ -32,7 +43,7 @@ Recovers = Literal["primitive", "composer"]
 
 
 @dataclass(frozen=True)
-class RecoveryPlan:
+class RecoveryPlan(Checked):
     """How recovery is learned and judged.
 
     Attributes:
@@ -51,38 +62,20 @@ class RecoveryPlan:
         enough: share of all trials with which recovery is learned.
     """
 
-    share: float = 0.15
+    share: Annotated[float, Range(0, 1, above=True, below=True)] = 0.15
     primitive: Literal["own", "first"] = "own"
-    falls: int = 512
-    demonstrations: int = 768
-    demonstration_share: float = 0.5
+    falls: Count = 512
+    demonstrations: Annotated[int, Range(0)] = 768
+    demonstration_share: Annotated[float, Range(0, 1, above=True, below=True)] = 0.5
     quick: bool = False
-    trials: int = 32
-    final_trials: int = 100
-    seconds: tuple[float, ...] = (5.0, 10.0)
-    enough: float = 0.98
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if not 0 < self.share < 1 or not 0 < self.enough <= 1:
-            what = f"share must lie in (0, 1) and enough in (0, 1], got {self.share} and {self.enough}"
-            raise PoiseError(what, "RecoveryPlan", code="out-of-range")
-        if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
-            raise PoiseError(
-                "recovery needs falls, trials and seconds", "RecoveryPlan", code="out-of-range"
-            )
-        if self.demonstrations < 0 or not 0 < self.demonstration_share < 1:
-            what = (
-                f"got {self.demonstrations} demonstrations and a demonstration_share of "
-                f"{self.demonstration_share:g}"
-            )
-            raise PoiseError(
-                what, "RecoveryPlan", "None or more, and a share between 0 and 1", code="out-of-range"
-            )
+    trials: Count = 32
+    final_trials: Count = 100
+    seconds: Annotated[tuple[float, ...], Length(1)] = (5.0, 10.0)
+    enough: Annotated[float, Range(0, 1, above=True)] = 0.98
 
 
 @dataclass(frozen=True)
-class PushPlan:
+class PushPlan(Checked):
     """Pushes in training, to which goals give way by Deep Compliant Control's law.
 
     Attributes:
@@ -92,22 +85,13 @@ class PushPlan:
         level: between which the level of compliance is drawn in each episode.
     """
 
-    share: float = 0.5
+    share: Annotated[float, Range(0, 1, above=True)] = 0.5
     newtons: tuple[float, float] = (20.0, 200.0)
     every_s: tuple[float, float] = (0.3, 2.0)
     lasts_s: tuple[float, float] = (0.1, 2.0)
-    impulse_ns: float = 50.0
-    parts: tuple[str, ...] = ("pelvis", "spine", "head", "hand", "upper_arm")
+    impulse_ns: Limit = 50.0
+    parts: Annotated[tuple[str, ...], Length(1)] = ("pelvis", "spine", "head", "hand", "upper_arm")
     level: tuple[float, float] = (0.0, 0.2)
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if not 0.0 < self.share <= 1.0 or not self.parts:
-            raise PoiseError(
-                f"pushes need a share above 0 and parts, got {self.share:g}",
-                "PushPlan",
-                code="out-of-range",
-            )
 
 
 @dataclass(frozen=True)
@@ -187,18 +171,18 @@ class Perpetual:
     shape: bool = False
     shapes: BodyShapes = field(default_factory=BodyShapes)
     heading: Literal["hips", "twist"] = "hips"
-    window: tuple[int, ...] = ()
-    filter: float = 0.0
+    window: Annotated[tuple[int, ...], Range(2, unit="control steps")] = ()
+    filter: Annotated[float, Range(0, 1, below=True)] = 0.0
     action: Literal["absolute", "additive"] = "absolute"
     faithful: Literal["paper", "code"] = "code"
     energy: float = 0.00005
     energy_form: Literal["paper", "code"] = "code"
-    root: float = 0.0
-    action_rate: float = 0.0
-    torque_rate: float = 0.0
-    acceleration: float = 0.0
-    foot_slide: float = 0.0
-    noise: tuple[float, ...] = ()
+    root: NotNegative = 0.0
+    action_rate: NotNegative = 0.0
+    torque_rate: NotNegative = 0.0
+    acceleration: NotNegative = 0.0
+    foot_slide: NotNegative = 0.0
+    noise: Annotated[tuple[float, ...], Range(0, 100, above=True, below=True)] = ()
     pushes: PushPlan | None = None
     style: AmpConfig | None = field(default_factory=AmpConfig)
     termination: Literal["relaxed", "all", "code"] = "relaxed"
@@ -208,7 +192,7 @@ class Perpetual:
     multiplicative: bool = True
     progressive: bool = True
     single: bool = False
-    max_primitives: int = 3
+    max_primitives: Count = 3
     start: Literal["copy", "random"] = "copy"
     lateral: bool = False
     combine: Literal["product", "means"] = "product"
@@ -219,15 +203,15 @@ class Perpetual:
     expert: bool = True
     trajopt: TrajOptConfig | None = None
     help_start: float = 100.0
-    help_share: float = 0.8
+    help_share: Annotated[float, Range(0, 1, above=True)] = 0.8
     help_by: Literal["all", "clip", "bin"] = "bin"
-    adaptive_sampling: float = 0.5
+    adaptive_sampling: Share = 0.5
     adaptive_over: Literal["clip", "library"] = "clip"
     residual_std: float = 0.3
-    shares: tuple[float, float] = (0.5, 0.8)
+    shares: Annotated[tuple[float, float], Range(0, 1, above=True, rising=True)] = (0.5, 0.8)
     evaluate_every: int = 0
-    starts: int = 1
-    cooling: float = 0.0
+    starts: Count = 1
+    cooling: Share = 0.0
     num_envs: int = 512
     horizon: int = 300
     seed: int = 0
@@ -250,26 +234,9 @@ class Perpetual:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.starts < 1:
-            raise PoiseError(
-                f"starts must be at least 1, got {self.starts}", "Perpetual", code="out-of-range"
-            )
-        if self.max_primitives < 1:
-            raise PoiseError(
-                f"there must be at least 1 primitive, got {self.max_primitives}", code="out-of-range"
-            )
-        first, last = self.shares
-        if not 0 < first <= last <= 1:
-            raise PoiseError(
-                f"shares must rise within (0, 1], got {self.shares}", "Perpetual", code="not-rising"
-            )
-        if self.recovery and last == 1:
+        if self.recovery and self.shares[1] == 1:
             what = "with recovery something must follow the last primitive, got shares up to 1"
             raise PoiseError(what, "Perpetual", code="settings-conflict")
-        if not 0 < self.help_share <= 1:
-            raise PoiseError(
-                f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual", code="out-of-range"
-            )
         if self.recovering.primitive == "first" and self.max_primitives < 2:
             what = "where the first primitive recovers there must be another, got max_primitives=1"
             raise PoiseError(what, "Perpetual", code="settings-conflict")
@@ -278,36 +245,18 @@ class Perpetual:
             raise PoiseError(
                 what, hint="Take absolute actions, or rotations as the goal", code="settings-conflict"
             )
-        if not 0 <= self.adaptive_sampling <= 1:
-            what = f"adaptive_sampling must lie in [0, 1], got {self.adaptive_sampling}"
-            raise PoiseError(what, "Perpetual", code="out-of-range")
-        if list(self.window) != sorted({k for k in self.window if k > 1}):
-            what = f"window must rise from 2 or more control steps, got {self.window}"
+        if list(self.window) != sorted(set(self.window)):
+            what = f"window must rise, got {self.window}"
             raise PoiseError(what, "Perpetual", "The next step is told in any case", code="not-rising")
-        if not 0 <= self.filter < 1:
+        if len(set(self.noise)) < len(self.noise):
             raise PoiseError(
-                f"filter must lie in 0 to below 1, got {self.filter}", "Perpetual", code="out-of-range"
-            )
-        prices = self.action_rate, self.torque_rate, self.acceleration, self.foot_slide
-        if min(self.root, *prices) < 0:
-            raise PoiseError(
-                "the weight of root and all prices must be at least 0", "Perpetual", code="out-of-range"
-            )
-        if any(not 0 < x < 100 for x in self.noise) or len(set(self.noise)) < len(self.noise):
-            raise PoiseError(
-                f"noise needs different strengths above 0, got {self.noise}",
-                "Perpetual",
-                code="out-of-range",
+                f"noise needs different strengths, got {self.noise}", "Perpetual", code="out-of-range"
             )
         if self.noise and self.shapes.several:
             raise PoiseError(
                 "noise is learned on one body, and there are several shapes",
                 "Perpetual",
                 code="settings-conflict",
-            )
-        if not 0 <= self.cooling <= 1:
-            raise PoiseError(
-                f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual", code="out-of-range"
             )
         if self.cooling and self.ppo.kl_target is not None:
             what = "cooling is for steps of a fixed size, and kl_target adapts them"

@@ -40,12 +40,12 @@ from poise.env.frame import TermFunction
 from poise.learn import PPOConfig
 from poise.motion import Clip
 from poise.recipes.imitation import Clips, Imitation, fitted
-from poise.settings import Migration, from_data, validate
+from poise.settings import Checked, Migration, from_data
 from poise.sim import SimConfig
 
 
 @dataclass(frozen=True)
-class ResidualForce:
+class ResidualForce(Checked):
     """Settings of one run.
 
     Attributes:
@@ -96,9 +96,6 @@ class ResidualForce:
     body: BodyConfig = BodyConfig()
     sim: SimConfig = SimConfig()
     ppo: PPOConfig = PPOConfig(std=0.055, policy_lr=3e-4)
-
-    def __post_init__(self) -> None:
-        validate(self)
 
     @classmethod
     def paper(cls, clip: Clip | None = None, **changes: Any) -> ResidualForce:

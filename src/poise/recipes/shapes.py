@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Annotated, cast
 
 import numpy as np
 from torch import Tensor
@@ -33,6 +33,7 @@ from poise.kinematics.fit import widen
 from poise.kinematics.retarget.own_body import own_table
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.recipes.imitation import Imitation
+from poise.settings import Range, validate
 
 #: Kinds of parts that are scaled together.
 GROUPS: tuple[tuple[str, ...], ...] = (
@@ -62,29 +63,26 @@ class BodyShapes:
             hierarchy with bones of several lengths; bodies within `SAME_BODY_M` are one.
     """
 
-    count: int = 1
-    low: float = 0.85
-    high: float = 1.15
-    per_clip: int = 0
+    count: Annotated[int, Range(1, 1000, unit="bodies")] = 1
+    low: Annotated[float, Range(0.5, 2)] = 0.85
+    high: Annotated[float, Range(0.5, 2)] = 1.15
+    per_clip: Annotated[int, Range(0)] = 0
     seed: int = 0
     own: bool = False
 
     def __post_init__(self) -> None:
+        validate(self)
         if self.own and self.count > 1:
             raise PoiseError(
                 "bodies are drawn or the clips' own, not both", "BodyShapes", code="settings-conflict"
             )
-        if not 1 <= self.count <= 1000:
+        if self.low > self.high:
             raise PoiseError(
-                f"there can be 1 to 1000 bodies, got {self.count}", "BodyShapes", code="out-of-range"
-            )
-        if not 0.5 <= self.low <= self.high <= 2.0:
-            raise PoiseError(
-                f"sizes must rise within 0.5 to 2, got {self.low:g} to {self.high:g}",
+                f"sizes must rise from low to high, got {self.low:g} to {self.high:g}",
                 "BodyShapes",
                 code="not-rising",
             )
-        if not 0 <= self.per_clip <= self.count:
+        if self.per_clip > self.count:
             raise PoiseError(
                 f"a clip can be done on 1 to {self.count} bodies, got {self.per_clip}",
                 "BodyShapes",

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import mujoco
 import torch
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
+from poise.settings import Range, validate
 from poise.sim.drive import Drive
 
 STANDARD_FIELDS = ("qpos", "qvel", "time", "xpos", "xquat", "xipos", "subtree_com", "cvel")
@@ -214,10 +215,6 @@ INTEGRATORS = {
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
 
-#: Above these a run of seconds would take days.
-MOST = {"rate_hz": 20_000.0, "control_hz": 20_000.0, "iterations": 10_000, "ls_iterations": 10_000,
-        "tolerance": 1.0}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class SimConfig:
@@ -237,33 +234,18 @@ class SimConfig:
         tolerance: at which it stops.
     """
 
-    rate_hz: float = 60.0
-    control_hz: float = 30.0
-    integrator: str = "discrete"
-    solver: str = "newton"
-    cone: str = "pyramidal"
-    iterations: int = 100
-    ls_iterations: int = 50
-    tolerance: float = 1e-8
+    # Above these limits a run of seconds would take days.
+    rate_hz: Annotated[float, Range(0, 20_000, above=True, unit="Hz")] = 60.0
+    control_hz: Annotated[float, Range(0, 20_000, above=True, unit="Hz")] = 30.0
+    integrator: Literal["discrete", "implicitfast", "euler"] = "discrete"
+    solver: Literal["newton", "cg"] = "newton"
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    iterations: Annotated[int, Range(0, 10_000, above=True)] = 100
+    ls_iterations: Annotated[int, Range(0, 10_000, above=True)] = 50
+    tolerance: Annotated[float, Range(0, 1, above=True)] = 1e-8
 
     def __post_init__(self) -> None:
-        for name, known in (("integrator", INTEGRATORS), ("solver", SOLVERS), ("cone", CONES)):
-            value = getattr(self, name)
-            if value not in known:
-                hint = did_you_mean(value, list(known))
-                raise PoiseError(f"unknown {name} '{value}'", "SimConfig", hint, code="unknown-choice")
-        for name in ("rate_hz", "control_hz", "iterations", "ls_iterations", "tolerance"):
-            value = getattr(self, name)
-            if not 0 < value < float("inf"):
-                raise PoiseError(
-                    f"{name} must be above 0, got {value}", "SimConfig", code="out-of-range"
-                )
-            if value > MOST[name]:
-                raise PoiseError(
-                    f"{name} must be at most {MOST[name]:g}, got {value:g}",
-                    "SimConfig",
-                    code="out-of-range",
-                )
+        validate(self)
         ratio = self.rate_hz / self.control_hz
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             nearest = max(1, round(ratio)) * self.control_hz

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import mujoco
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.settings import Checked, Range, validate
 
 #: Coefficients of sliding, torsional and rolling friction of floors and props.
 FRICTION = (1.0, 0.1, 0.1)
@@ -44,7 +45,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Steps:
+class Steps(Checked):
     """Stairs that rise along +X, between a plane z = 0 and a landing.
 
     Attributes:
@@ -55,25 +56,12 @@ class Steps:
         landing: depth of the last step, m.
     """
 
-    count: int = 4
-    rise: float = 0.17
-    tread: float = 0.29
+    count: Annotated[int, Range(1, 100)] = 4
+    rise: Annotated[float, Range(0, 100, above=True, below=True, unit="m")] = 0.17
+    tread: Annotated[float, Range(0, 100, above=True, below=True, unit="m")] = 0.29
     start: float = 1.0
-    width: float = 2.0
-    landing: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.count <= 100:
-            raise PoiseError(
-                f"stairs have 1 to 100 steps, got {self.count}", "Steps", code="out-of-range"
-            )
-        for name in ("rise", "tread", "width", "landing"):
-            if not 0.0 < getattr(self, name) < 100.0:
-                raise PoiseError(
-                    f"{name} must lie between 0 and 100 m, got {getattr(self, name)}",
-                    "Steps",
-                    code="out-of-range",
-                )
+    width: Annotated[float, Range(0, 100, above=True, below=True, unit="m")] = 2.0
+    landing: Annotated[float, Range(0, 100, above=True, below=True, unit="m")] = 2.0
 
     def add(self, spec: mujoco.MjSpec, friction: float) -> None:
         """Adds the plane "floor" and boxes "floor_1", "floor_2", ..., from the lowest up."""
@@ -103,9 +91,10 @@ class HeightField:
     """
 
     heights: np.ndarray
-    size: tuple[float, float]
+    size: Annotated[tuple[float, float], Range(0, above=True, unit="m")]
 
     def __post_init__(self) -> None:
+        validate(self)
         h = self.heights
         if h.ndim != 2 or min(h.shape) < 2:
             raise PoiseError(
@@ -116,10 +105,6 @@ class HeightField:
         if not np.isfinite(h).all() or h.min() < 0.0:
             raise PoiseError(
                 "heights must be finite and at least 0 m", "HeightField", code="out-of-range"
-            )
-        if not min(self.size) > 0.0:
-            raise PoiseError(
-                f"its size must be above 0 m, got {self.size}", "HeightField", code="out-of-range"
             )
 
     def add(self, spec: mujoco.MjSpec, friction: float) -> None:

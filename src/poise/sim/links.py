@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.settings import validate
 
 #: m; links of bodies that are farther apart when they are switched on are a mistake.
 FAR_M = 0.5
@@ -48,17 +49,12 @@ class Link:
     touch: bool = True
 
     def __post_init__(self) -> None:
+        validate(self)
         if self.a == self.b:
             raise PoiseError(
                 f"a link joins two bodies, got '{self.a}' twice",
                 f"Link '{self.name}'",
                 code="name-repeated",
-            )
-        if self.kind not in ("weld", "ball"):
-            raise PoiseError(
-                f"a link is a weld or a ball, got '{self.kind}'",
-                f"Link '{self.name}'",
-                code="unknown-choice",
             )
         if self.kind == "weld" and self.to is not None:
             raise PoiseError(

@@ -7,12 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import mujoco
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.settings import Checked, NotNegative, Positive, Range, validate
 from poise.sim.floor import FRICTION
 
 Vector = tuple[float, float, float]
@@ -46,16 +47,8 @@ def solid(
     return geom
 
 
-def above_zero(where: str, **values: float | Sequence[float]) -> None:
-    """Raises where a number, or one of several, is not finite and above 0."""
-    for name, value in values.items():
-        numbers = value if isinstance(value, Sequence) else (value,)
-        if not all(0.0 < x < float("inf") for x in numbers):
-            raise PoiseError(f"{name} must be above 0, got {value}", where, code="out-of-range")
-
-
 @dataclass(frozen=True)
-class Box:
+class Box(Checked):
     """A box.
 
     Attributes:
@@ -67,15 +60,10 @@ class Box:
     """
 
     name: str = "box"
-    size: Vector = (0.4, 0.4, 0.4)
+    size: Annotated[Vector, Range(0, above=True)] = (0.4, 0.4, 0.4)
     pos: Vector = (0.0, 0.0, 0.2)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    mass: float = 0.0
-
-    def __post_init__(self) -> None:
-        above_zero(f"Box '{self.name}'", size=self.size)
-        if self.mass != 0.0:
-            above_zero(f"Box '{self.name}'", mass=self.mass)
+    mass: NotNegative = 0.0
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body."""
@@ -91,7 +79,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
-class Carrier:
+class Carrier(Checked):
     """A plate with a motion of its own: a moving walkway, a hand that leads, a vehicle.
 
     A mocap body of MuJoCo has no velocity, so that it carries nothing and pulls with a lag. This one is
@@ -107,12 +95,9 @@ class Carrier:
     """
 
     name: str = "carrier"
-    size: Vector = (1.0, 1.0, 0.1)
+    size: Annotated[Vector, Range(0, above=True)] = (1.0, 1.0, 0.1)
     pos: Vector = (0.0, 0.0, 0.05)
     touched: bool = True
-
-    def __post_init__(self) -> None:
-        above_zero(f"Carrier '{self.name}'", size=self.size)
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body on three slides and a hinge."""
@@ -134,7 +119,7 @@ KNOB_IN, KNOB_UP, KNOB_R = 0.07, 1.0, 0.03
 
 
 @dataclass(frozen=True)
-class Door:
+class Door(Checked):
     """A leaf that turns about the vertical through its hinge; closed it reaches along +Y.
 
     It has one coordinate, the angle it is open, rad.
@@ -152,11 +137,11 @@ class Door:
 
     name: str = "door"
     pos: Vector = (1.0, -0.45, 0.0)
-    width: float = 0.9
-    height: float = 2.0
-    thickness: float = 0.04
-    mass: float = 20.0
-    opens: float = 2.0
+    width: Positive = 0.9
+    height: Positive = 2.0
+    thickness: Positive = 0.04
+    mass: Positive = 20.0
+    opens: Positive = 2.0
     damping: float = 1.0
     friction: float = 0.5
     knob_up: float = KNOB_UP
@@ -165,10 +150,6 @@ class Door:
     def knob(self) -> Vector:
         """The front knob's centre, m, in the leaf's frame."""
         return -(self.thickness / 2 + KNOB_R), self.width - KNOB_IN, self.knob_up
-
-    def __post_init__(self) -> None:
-        sizes = {k: getattr(self, k) for k in ("width", "height", "thickness", "mass", "opens")}
-        above_zero(f"Door '{self.name}'", **sizes)
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body with a hinge; the geoms of the knobs are "NAME/knob_front" (toward -X) and
@@ -190,7 +171,7 @@ class Door:
 
 
 @dataclass(frozen=True)
-class Lift:
+class Lift(Checked):
     """A plate on a vertical slide, driven toward a height by a spring and a damper.
 
     It has one coordinate, the height above `pos`, m, and one control, the height wanted.
@@ -206,16 +187,12 @@ class Lift:
     """
 
     name: str = "lift"
-    size: tuple[float, float] = (1.5, 1.5)
+    size: Annotated[tuple[float, float], Range(0, above=True)] = (1.5, 1.5)
     pos: Vector = (0.0, 0.0, 0.3)
-    mass: float = 20.0
-    stiffness: float = 2e4
-    damping: float = 500.0
-    travel: float = 0.3
-
-    def __post_init__(self) -> None:
-        numbers = {k: getattr(self, k) for k in ("size", "mass", "stiffness", "damping", "travel")}
-        above_zero(f"Lift '{self.name}'", **numbers)
+    mass: Positive = 20.0
+    stiffness: Positive = 2e4
+    damping: Positive = 500.0
+    travel: Positive = 0.3
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body with a slide and its actuator."""
@@ -250,11 +227,10 @@ class Mesh:
     name: str = "mesh"
     pos: Vector = (0.0, 0.0, 0.0)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    mass: float = 0.0
+    mass: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        if self.mass != 0.0:
-            above_zero(f"Mesh '{self.name}'", mass=self.mass)
+        validate(self)
         if not Path(self.path).is_file():
             raise PoiseError("there is no such file", str(self.path), code="file-missing")
 
@@ -297,7 +273,7 @@ def _open_edges(vertices: np.ndarray, faces: np.ndarray) -> int:
 
 
 @dataclass(frozen=True)
-class Rod:
+class Rod(Checked):
     """A free rod that stands on its lower end and carries a ball on the upper one; one body, with the
     lower end as its origin. Nothing touches it, so that what it stands on must be a link.
 
@@ -310,14 +286,10 @@ class Rod:
     """
 
     name: str = "rod"
-    length: float = 1.0
-    radius: float = 0.08
-    mass: float = 0.5
+    length: Positive = 1.0
+    radius: Positive = 0.08
+    mass: Positive = 0.5
     pos: Vector = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        sizes = {k: getattr(self, k) for k in ("length", "radius", "mass")}
-        above_zero(f"Rod '{self.name}'", **sizes)
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body."""
@@ -334,7 +306,7 @@ class Rod:
 
 
 @dataclass(frozen=True)
-class Ball:
+class Ball(Checked):
     """A free ball.
 
     Attributes:
@@ -345,12 +317,9 @@ class Ball:
     """
 
     name: str = "ball"
-    radius: float = 0.12
-    mass: float = 0.6
+    radius: Positive = 0.12
+    mass: Positive = 0.6
     pos: Vector = (0.0, 0.0, 0.12)
-
-    def __post_init__(self) -> None:
-        above_zero(f"Ball '{self.name}'", radius=self.radius, mass=self.mass)
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body."""
@@ -360,7 +329,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Trampoline:
+class Trampoline(Checked):
     """A plate that a spring and a damper at each corner hold at a height that is its control.
 
     It has three coordinates, the height above `pos`, m, and its tilts about X and Y, rad, and four
@@ -376,15 +345,11 @@ class Trampoline:
     """
 
     name: str = "trampoline"
-    size: tuple[float, float] = (2.4, 2.4)
+    size: Annotated[tuple[float, float], Range(0, above=True)] = (2.4, 2.4)
     pos: Vector = (0.0, 0.0, 0.0)
-    mass: float = 20.0
-    stiffness: float = 4000.0
-    damping: float = 120.0
-
-    def __post_init__(self) -> None:
-        numbers = {k: getattr(self, k) for k in ("size", "mass", "stiffness", "damping")}
-        above_zero(f"Trampoline '{self.name}'", **numbers)
+    mass: Positive = 20.0
+    stiffness: Positive = 4000.0
+    damping: Positive = 120.0
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body on a slide and two hinges, and its actuators "NAME/0" to "NAME/3"."""

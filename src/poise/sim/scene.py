@@ -13,12 +13,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated
 
 import mujoco
 
 from poise.body import Humanoid
 from poise.body.humanoid import add_humanoid
 from poise.errors import PoiseError, did_you_mean
+from poise.settings import Length, validate
 from poise.sim.backend import SimConfig
 from poise.sim.floor import Floor, Plane
 from poise.sim.links import Link, Place, place_of
@@ -77,19 +79,14 @@ class Scene:
         sim: physics settings.
     """
 
-    things: tuple[Character | Prop, ...]
+    things: Annotated[tuple[Character | Prop, ...], Length(0, MOST)]
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
     floor: Floor = field(default_factory=Plane)
     sim: SimConfig = field(default_factory=SimConfig)
 
     def __post_init__(self) -> None:
-        if len(self.things) > MOST:
-            raise PoiseError(
-                f"a scene holds at most {MOST} things, got {len(self.things)}",
-                "Scene",
-                code="over-limit",
-            )
+        validate(self)
         for what in ("things", "links", "touches"):
             names = [x.name for x in getattr(self, what)]
             twice = next((n for n in names if names.count(n) > 1), None)

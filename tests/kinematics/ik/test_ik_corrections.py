@@ -93,7 +93,7 @@ def test_a_switch_follows_what_the_config_is_faithful_to():
     assert not any(PAPER.on(c) for c in CORRECTIONS)
     mixed = IkConfig(faithful="paper", square_ankle=True)
     assert [c for c in CORRECTIONS if mixed.on(c)] == ["square_ankle"]
-    with refused("unknown-choice"):
+    with refused("unknown-choice", says=("faithful", "code")):
         IkConfig(faithful="code")
     with refused("out-of-range", says="straight"):
         IkConfig(straight=0.0)

@@ -101,7 +101,7 @@ def test_an_opponent_out_of_reach_moves_as_if_it_were_alone(tracker: Tracker, ta
 
 
 def test_players_that_are_none() -> None:
-    with refused("out-of-range", says=("1", "36")):
+    with refused("out-of-range", says=("mass", "1")):
         Chicken(mass=1.0)
-    with refused("unknown-choice", says="against"):
+    with refused("unknown-choice", says=("against", "wall")):
         Chicken(against="wall")  # type: ignore[arg-type]

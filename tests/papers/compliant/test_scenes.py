@@ -266,17 +266,17 @@ def test_a_skeleton_without_a_head(task: Imitation) -> None:
 @pytest.mark.parametrize(
     ("made", "what"),
     [
-        (lambda: Pull(0.0), "pull"),
-        (lambda: Pull(direction=(0.0, 0.0, 0.0)), "pull"),
-        (lambda: Pull(lasts_s=0.0), "pull"),
-        (lambda: Hands(sway=2.0), "hands"),
-        (lambda: Doorway(0.0), "door"),
-        (lambda: Doorway(made_for=9.0), "door"),
-        (lambda: Throws(mass=0.0), "throws"),
-        (lambda: Trampoline(2.0), "trampoline"),
-        (lambda: Trampoline(first=3.0), "trampoline"),
-        (lambda: Balance(length=0.0), "ball"),
-        (lambda: Balance(pushes=-1.0), "ball"),
+        (lambda: Pull(0.0), "pull: newtons must be above 0"),
+        (lambda: Pull(direction=(0.0, 0.0, 0.0)), "a pull needs a direction"),
+        (lambda: Pull(lasts_s=0.0), "lasts_s must be above 0"),
+        (lambda: Hands(sway=2.0), "sway must be at least 0 and below 1 m"),
+        (lambda: Doorway(0.0), "width must be above 0 and below 10 m"),
+        (lambda: Doorway(made_for=9.0), "made_for must lie in 0.5 to 3 m"),
+        (lambda: Throws(mass=0.0), "mass must be above 0 and below 100 kg"),
+        (lambda: Trampoline(2.0), "height must lie in 0 to 1 m"),
+        (lambda: Trampoline(first=3.0), "first must be at least 0 and below 3 s"),
+        (lambda: Balance(length=0.0), "length must lie in 0.1 to 5 m"),
+        (lambda: Balance(pushes=-1.0), "pushes must be at least 0"),
     ],
 )
 def test_scenes_that_are_none(made: object, what: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from poise.env.plugins import Plugin
 from poise.env.recovery.falls import Drop, fall_states, rest_angles
 from poise.env.reference import Start
 from poise.errors import PoiseError
+from poise.settings import Range, Share, validate
 from poise.sim import Backend
 
 #: Bits of an episode's kind; CONTINUED is set when it goes on after a failure.
@@ -40,39 +41,20 @@ class Recovery:
         drop: how the fallen fell.
     """
 
-    fallen: float = 0.3
-    far: float = 0.3
-    continues: float = 0.5
-    grace: int = 90
-    distance: tuple[float, float] = (2.0, 5.0)
+    fallen: Share = 0.3
+    far: Share = 0.3
+    continues: Share = 0.5
+    grace: Annotated[int, Range(0)] = 90
+    distance: Annotated[tuple[float, float], Range(0, rising=True, unit="m")] = (2.0, 5.0)
     by_area: bool = False
-    switch: float = 0.5
-    reach: float = 5.0
-    settle: int = 30
+    switch: Annotated[float, Range(0, above=True, infinite=True)] = 0.5
+    reach: Annotated[float, Range(0, above=True, infinite=True)] = 5.0
+    settle: Annotated[int, Range(0)] = 30
     drop: Drop = field(default_factory=Drop)
 
     def __post_init__(self) -> None:
-        for name in ("fallen", "far", "continues"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise PoiseError(
-                    f"{name} must lie in [0, 1], got {getattr(self, name)}",
-                    "Recovery",
-                    code="out-of-range",
-                )
-        if self.grace < 0 or self.settle < 0:
-            raise PoiseError(
-                f"grace and settle must not be below 0, got {self.grace} and {self.settle}",
-                "Recovery",
-                code="out-of-range",
-            )
-        low, high = self.distance
-        if not 0 <= low <= high < math.inf:
-            raise PoiseError(
-                f"distance must rise from 0 or more, got {low:g} to {high:g}",
-                "Recovery",
-                code="not-rising",
-            )
-        if not 0 < self.switch < self.reach and self.switch < math.inf:
+        validate(self)
+        if self.reach <= self.switch < math.inf:
             raise PoiseError(
                 f"switch must lie above 0 and below reach, got {self.switch:g} and {self.reach:g} m",
                 "Recovery",

@@ -13,7 +13,7 @@ from poise.control import PDTargets
 from poise.errors import PoiseError
 from poise.kinematics import Kinematics, lowest_height
 from poise.motion.rotations import normalize
-from poise.settings import validate
+from poise.settings import Checked, Count, Positive
 from poise.sim import Backend
 
 #: Physics steps over which a random torque is held.
@@ -29,7 +29,7 @@ ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Drop:
+class Drop(Checked):
     """How characters are let fall: in a random orientation from standing height, then driven a while.
 
     Attributes:
@@ -41,17 +41,9 @@ class Drop:
     """
 
     by: Literal["torques", "action"] = "torques"
-    size: float = 0.2
-    steps: int = 150
-    count: int = 512
-
-    def __post_init__(self) -> None:
-        validate(self)
-        for name in ("size", "steps", "count"):
-            if not getattr(self, name) > 0:
-                raise PoiseError(
-                    f"{name} must be above 0, got {getattr(self, name)}", "Drop", code="out-of-range"
-                )
+    size: Positive = 0.2
+    steps: Count = 150
+    count: Count = 512
 
 
 def fall_states(

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from poise.motion import Clip
 from poise.plan import LookaheadConfig
 from poise.score.card import NO_HELP
 from poise.score.report import Report, Shape, Track, write_report
-from poise.settings import validate
+from poise.settings import Range, validate
 from poise.version import __version__
 
 #: The most characters in a world.
@@ -61,8 +61,8 @@ class Dream:
         threads: cores of lookahead, 0 is all of them.
     """
 
-    temperature: float = 1.0
-    count: int = 1
+    temperature: Annotated[float, Range(0, 10)] = 1.0
+    count: Annotated[int, Range(1, MOST, unit="characters")] = 1
     targets: tuple[tuple[float, float], ...] = ()
     seed: int = 0
     controller: Literal["lookahead", "policy"] = "lookahead"
@@ -70,24 +70,12 @@ class Dream:
     recover: bool = True
     past: Literal["own", "simulated"] = "own"
     style: str | None = None
-    label_seconds: float = 10.0
+    label_seconds: Annotated[float, Range(0, 3600, unit="s")] = 10.0
     hold_feet: bool = True
     threads: int = 0
 
     def __post_init__(self) -> None:
         validate(self)
-        if not 1 <= self.count <= MOST:
-            raise PoiseError(
-                f"there may be 1 to {MOST} characters, got {self.count}", code="out-of-range"
-            )
-        if not 0 <= self.temperature <= 10:
-            raise PoiseError(
-                f"the temperature must lie in 0 to 10, got {self.temperature:g}", code="out-of-range"
-            )
-        if not 0 <= self.label_seconds <= 3600:
-            raise PoiseError(
-                f"a label is kept to for 0 to 3600 s, got {self.label_seconds:g}", code="out-of-range"
-            )
         Steering(self.targets)
 
 

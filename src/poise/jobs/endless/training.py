@@ -34,7 +34,7 @@ from poise.learn.checkpoint import load_checkpoint, save_checkpoint, take
 from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, CVAEObjective, CVAETraining, Frames, make_cvae
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
 from poise.motion import ClipLibrary
-from poise.settings import from_data, to_data, validate
+from poise.settings import Checked, Share, from_data, to_data
 from poise.synthesis.generator import ROOT, Codes, coordinates, features_of
 
 #: Pasts that are kept, from which motions begin.
@@ -46,7 +46,7 @@ LASTS = 0.5
 
 
 @dataclass(frozen=True)
-class Endless:
+class Endless(Checked):
     """Settings of a kinematic policy's training.
 
     Attributes:
@@ -66,15 +66,8 @@ class Endless:
     steps: int = 20_000
     ema: float = 0.999
     codes: int = 4096
-    balance: float = 0.0
+    balance: Share = 0.0
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if not 0 <= self.balance <= 1:
-            raise PoiseError(
-                f"balance must lie in 0 to 1, got {self.balance:g}", "Endless", code="out-of-range"
-            )
 
     @classmethod
     def paper(cls) -> Endless:

@@ -55,7 +55,7 @@ from poise.motion.windows import (
     without_still_root,
 )
 from poise.score.gaps import LAFAN1, Protocol, TestSet, deviation, evaluate, test_set
-from poise.settings import from_data, to_data, validate
+from poise.settings import Checked, from_data, to_data
 
 
 def library_bank(
@@ -176,7 +176,7 @@ FRAMES = "frames.safetensors"
 
 
 @dataclass(frozen=True)
-class Inbetween:
+class Inbetween(Checked):
     """Settings of one network's training.
 
     Attributes:
@@ -210,9 +210,6 @@ class Inbetween:
     between_training: BetweenTraining = field(default_factory=BetweenTraining)
     rtn: RTNConfig = field(default_factory=RTNConfig)
     rtn_training: RTNTraining = field(default_factory=RTNTraining)
-
-    def __post_init__(self) -> None:
-        validate(self)
 
     @classmethod
     def paper(cls, **changes: Any) -> Inbetween:

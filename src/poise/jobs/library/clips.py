@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from poise.body import BodyConfig, BodyTable, generate_table, read_mjcf
 from poise.errors import PoiseError
@@ -20,6 +20,7 @@ from poise.kinematics.repair.estimate import clean_clip
 from poise.kinematics.repair.needs import AloneRules, leaps, longest_alone, not_alone
 from poise.kinematics.travel import find_travel, travelled
 from poise.motion import Clip, Skeleton, resample, shifted, trim
+from poise.settings import Limit, Range, validate
 
 State = Literal["kept", "cut", "left out"]
 
@@ -166,11 +167,11 @@ class LibraryConfig:
         own_bones: each skeleton keeps its lengths on the target's joints, see `own_body`.
     """
 
-    min_frames: int = 10
+    min_frames: Annotated[int, Range(3)] = 10
     min_cut_s: float = 1.0
     rules: AloneRules = field(default_factory=AloneRules)
     words: tuple[str, ...] = WORDS
-    max_unlike_deg: float = 20.0
+    max_unlike_deg: Limit = 20.0
     keep: tuple[str, ...] = ()
     leave_out: tuple[str, ...] = ()
     skeletons: tuple[tuple[str, str], ...] = ()
@@ -182,12 +183,9 @@ class LibraryConfig:
     own_bones: bool = False
 
     def __post_init__(self) -> None:
+        validate(self)
         taken = (*self.keep, *self.leave_out, *self.backwards)
         check_patterns((*taken, *(p for p, _ in (*self.skeletons, *self.rates))))
-        if self.min_frames < 3:
-            raise PoiseError(
-                f"min_frames must be at least 3, got {self.min_frames}", code="out-of-range"
-            )
 
 
 @dataclass(frozen=True, eq=False)

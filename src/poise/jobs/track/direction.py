@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from poise.body import BodyTable
 from poise.errors import PoiseError, did_you_mean
 from poise.kinematics.directed import LIMBS, PELVIS, Pin, TouchPoint, check_asked, directed, ease
 from poise.motion import Clip
+from poise.settings import Range, validate
 
 #: Cost per metre of distance in a control step of a part that counts twice, and of limbs that are
 #: pinned or touch.
@@ -38,17 +40,12 @@ class Weight:
     """
 
     part: str
-    factor: float
+    factor: Annotated[float, Range(0, MOST)]
     first: int | None = None
     last: int | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.factor <= MOST:
-            raise PoiseError(
-                f"a weight must lie in 0 to {MOST:g}, got {self.factor:g}",
-                self.part,
-                code="out-of-range",
-            )
+        validate(self, self.part)
 
 
 @dataclass(frozen=True)

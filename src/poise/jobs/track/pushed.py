@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -13,13 +12,14 @@ from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
 from poise.control import Compliance, Stiffness
-from poise.control.compliance import check_level, check_stiffness
+from poise.control.compliance import Level, NewtonsPerMetre
 from poise.env import ImitationEnv
 from poise.env.pushes import OnePush, Push
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.rotations import quat_rotate
 from poise.recipes.imitation import Imitation
+from poise.settings import Range, validate
 
 #: N; more is no push.
 MOST_N = 10_000.0
@@ -49,34 +49,22 @@ class PushConfig:
         law: of the level.
     """
 
-    newtons: float = 150.0
+    newtons: Annotated[float, Range(0, MOST_N, above=True, unit="N")] = 150.0
     at: str = "hand"
-    start_s: float = 1.0
-    seconds: float = 0.5
+    start_s: Annotated[float, Range(0, unit="s")] = 1.0
+    seconds: Annotated[float, Range(0, above=True, unit="s")] = 0.5
     direction: tuple[float, float, float] | None = None
-    level: float = 0.12
-    stiffness: float | None = None
+    level: Level = 0.12
+    stiffness: NewtonsPerMetre | None = None
     law: Literal["eq8", "algorithm1"] = "eq8"
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.newtons <= MOST_N:
+        validate(self, "the push")
+        if self.direction is not None and not any(self.direction):
             raise PoiseError(
-                f"a push must be above 0 and at most {MOST_N:g} N, got {self.newtons:g}",
-                code="out-of-range",
+                f"a direction must be three numbers, not all 0, got {self.direction}",
+                code="no-direction",
             )
-        if not (self.start_s >= 0.0 and 0.0 < self.seconds < math.inf):
-            what = f"got {self.start_s:g} s and {self.seconds:g} s"
-            raise PoiseError(
-                f"a push must begin at 0 s or later and last some time, {what}", code="out-of-range"
-            )
-        way = self.direction
-        if way is not None and not (np.isfinite(way).all() and np.linalg.norm(way) > 0.0):
-            raise PoiseError(
-                f"a direction must be three numbers, not all 0, got {way}", code="no-direction"
-            )
-        check_level(self.level)
-        if self.stiffness is not None:
-            check_stiffness(self.stiffness)
 
     @property
     def yields(self) -> Compliance | Stiffness:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from poise.errors import PoiseError
 from poise.jobs.track.direction import Direction
@@ -12,7 +12,7 @@ from poise.jobs.track.simulation import Retake
 from poise.kinematics.supports import Support
 from poise.motion.noise import Noise
 from poise.plan import LookaheadConfig, SamplingConfig
-from poise.settings import validate
+from poise.settings import Range, validate
 
 #: Characters in one world.
 MOST = 64
@@ -54,7 +54,7 @@ class TrackConfig:
     reset_on_fail: bool = False
     recover: bool = False
     smooth_hz: float | None = None
-    count: int = 1
+    count: Annotated[int, Range(1, MOST, unit="characters")] = 1
     controller: Controller = "auto"
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     search: SamplingConfig = field(default_factory=SamplingConfig)
@@ -68,10 +68,6 @@ class TrackConfig:
 
     def __post_init__(self) -> None:
         validate(self)
-        if not 1 <= self.count <= MOST:
-            raise PoiseError(
-                f"there can be 1 to {MOST} characters, got {self.count}", code="out-of-range"
-            )
         if self.recover and (self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that is put back onto the motion"
             raise PoiseError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from poise.kinematics.stream_noise import of_points
 from poise.motion import Clip, Skeleton
 from poise.motion.keypoints import Keypoints
 from poise.motion.rotations import forward_kinematics
+from poise.settings import Checked, Positive, Range
 
 #: Rounds in which bones get their length; the error halves about every third.
 LENGTH_ROUNDS = 12
@@ -143,7 +144,7 @@ BLOCK = 64
 
 
 @dataclass(frozen=True)
-class StreamConfig:
+class StreamConfig(Checked):
     """How a stream of keypoints is filtered.
 
     smooth_hz: cut-off of the filter on the keypoints; None smooths them as much as they tremble
@@ -152,17 +153,9 @@ class StreamConfig:
     max_speed: m/s, a keypoint that jumps faster is taken as missing (sprinters' feet reach 20).
     """
 
-    smooth_hz: float | None = None
-    lookahead: int = 1
-    max_speed: float = 25.0
-
-    def __post_init__(self) -> None:
-        if self.lookahead not in (0, 1):
-            raise PoiseError(
-                f"a stream looks 0 or 1 control steps ahead, not {self.lookahead}", code="out-of-range"
-            )
-        if not ((self.smooth_hz is None or self.smooth_hz > 0) and self.max_speed > 0):
-            raise PoiseError("frequencies and speeds of a stream must be above 0", code="out-of-range")
+    smooth_hz: Positive | None = None
+    lookahead: Annotated[int, Range(0, 1, unit="control steps")] = 1
+    max_speed: Annotated[float, Range(0, above=True, infinite=True)] = 25.0
 
 
 @dataclass(frozen=True, eq=False)

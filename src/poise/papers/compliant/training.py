@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.scenes import SCENES, PlayScene, Stage
 from poise.papers.compliant.scenes.ball import FictionalForces
 from poise.recipes.imitation import Imitation
-from poise.settings import Migration, from_data, to_data, validate
+from poise.settings import Migration, Range, Share, from_data, to_data, validate
 
 
 @dataclass(frozen=True)
@@ -171,14 +171,14 @@ class Compliant:
     scene: str = "ball"
     width: float = 1.0
     pushes: float = 0.0
-    seconds: float = 6.0
+    seconds: Annotated[float, Range(0.5, 600, unit="s")] = 6.0
     level: float | None = None
     stiffness: float | None = None
-    reach: float = 0.0
+    reach: Annotated[float, Range(0, math.pi, unit="rad")] = 0.0
     forces: bool = True
     imitation_weight: float = 0.5
     task_weight: float = 0.5
-    cooling: float = 0.4
+    cooling: Share = 0.4
     num_envs: int = 128
     seed: int = 0
     # The paper's networks. Its rate of 1e-5, its gamma of .95 and its noise of 6 degrees are not taken:
@@ -189,7 +189,7 @@ class Compliant:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        validate(self)
+        validate(self, "compliant")
         if self.scene not in LEARNED:
             hint = did_you_mean(self.scene, LEARNED)
             raise PoiseError(
@@ -197,17 +197,9 @@ class Compliant:
                 hint=hint,
                 code="scene-without-reward",
             )
-        if not 0 <= self.cooling <= 1:
-            raise PoiseError(
-                f"cooling must lie in 0 to 1, got {self.cooling:g}", "compliant", code="out-of-range"
-            )
-        if not 0.5 <= self.seconds <= 600.0:
-            raise PoiseError(
-                f"episodes last 0.5 to 600 s, got {self.seconds:g}", "compliant", code="out-of-range"
-            )
-        if not (0.0 <= self.reach <= math.pi and (self.reach or self.added(0).forces)):
-            what = "reach must lie in 0 to pi, and above 0 where there are no forces to learn"
-            raise PoiseError(f"{what}, got {self.reach:g}", "compliant", code="out-of-range")
+        if not (self.reach or self.added(0).forces):
+            what = "reach must be above 0 where there are no forces to learn, got 0"
+            raise PoiseError(what, "compliant")
 
     def added(self, seen: int) -> Added:
         """What is learned on top of a policy that sees so many numbers."""

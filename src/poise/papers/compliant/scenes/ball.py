@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
 from poise.papers.compliant.scenes.stage import Given, Stage
+from poise.settings import Range, validate
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
 from poise.sim.props import Rod
 
@@ -59,21 +61,15 @@ class Balance:
         seed: of the draws.
     """
 
-    length: float = 1.0
-    spread: float = 0.02
+    length: Annotated[float, Range(0.1, 5, unit="m")] = 1.0
+    spread: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.02
     gain: float = GAIN
     damping: float = DAMPING
-    pushes: float = 0.0
+    pushes: Annotated[float, Range(0, 10_000, below=True, unit="N")] = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (0.1 <= self.length <= 5.0 and 0.0 <= self.spread < 1.0):
-            what = f"a rod is 0.1 to 5 m long and tilted by less than 1 rad, got {self.length:g} m"
-            raise PoiseError(f"{what} and {self.spread:g} rad", "ball", code="out-of-range")
-        if not 0.0 <= self.pushes < 10_000.0:
-            raise PoiseError(
-                f"a push has at least 0 N, got {self.pushes:g}", "ball", code="out-of-range"
-            )
+        validate(self, "ball")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The rod, its joint on the head, the fictional forces and the task's terms.

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from poise.env.reference import Reference
 from poise.env.things import Move, SetDown, Switch, Throw, always
 from poise.errors import PoiseError
 from poise.papers.compliant.scenes.stage import Given, Stage, as_given, hand_of
+from poise.settings import Range, validate
 from poise.sim import Link, Plane, SceneSim, Touch
 from poise.sim.props import Ball, Box, Carrier
 from poise.sim.props import Trampoline as Plate
@@ -41,17 +42,12 @@ class Hands:
     """
 
     side: Literal["left", "right"] = "left"
-    lead: float = 0.0
-    sway: float = 0.1
-    every_s: float = 2.0
+    lead: Annotated[float, Range(-10, 10, above=True, below=True, unit="m/s")] = 0.0
+    sway: Annotated[float, Range(0, 1, below=True, unit="m")] = 0.1
+    every_s: Annotated[float, Range(0.1, above=True, unit="s")] = 2.0
 
     def __post_init__(self) -> None:
-        if not (abs(self.lead) < 10.0 and 0.0 <= self.sway < 1.0 and self.every_s > 0.1):
-            raise PoiseError(
-                "the partner's lead must be below 10 m/s, its sway below 1 m, a swing longer than 0.1 s",
-                "hands",
-                code="out-of-range",
-            )
+        validate(self, "hands")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The partner's hand where the character's is at first, and the link; its force is felt."""
@@ -107,25 +103,14 @@ class Chicken:
         seed: of the draws.
     """
 
-    mass: float = HEAVY_KG
-    other: float = LIGHT_KG
+    mass: Annotated[float, Range(2, 500, unit="kg")] = HEAVY_KG
+    other: Annotated[float, Range(2, 500, unit="kg")] = LIGHT_KG
     against: Literal["bag", "rival"] = "bag"
     speed: tuple[float, float] = (0.8, 1.2)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (2.0 <= self.mass <= 500.0 and 2.0 <= self.other <= 500.0):
-            raise PoiseError(
-                f"players weigh 2 to 500 kg, got {self.mass:g} and {self.other:g}",
-                "chicken",
-                code="out-of-range",
-            )
-        if self.against not in ("bag", "rival"):
-            raise PoiseError(
-                f"it is played against a bag or a rival, got '{self.against}'",
-                "chicken",
-                code="unknown-choice",
-            )
+        validate(self, "chicken")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The bag, its throws and all touches with it; of a rival the touches alone."""
@@ -169,22 +154,16 @@ class Pull:
         lasts_s: s, for how long.
     """
 
-    newtons: float = 20.0
+    newtons: Annotated[float, Range(0, 1e4, above=True, below=True, unit="N")] = 20.0
     side: Literal["left", "right"] = "left"
     direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    start_s: float = 0.5
-    lasts_s: float = 60.0
+    start_s: Annotated[float, Range(0, unit="s")] = 0.5
+    lasts_s: Annotated[float, Range(0, above=True, unit="s")] = 60.0
 
     def __post_init__(self) -> None:
-        size = float(np.linalg.norm(self.direction))
-        if not (0.0 < self.newtons < 1e4 and size > 0.0 and np.isfinite(size)):
-            raise PoiseError(
-                "a pull needs a force above 0 N and a direction", "pull", code="out-of-range"
-            )
-        if not (self.start_s >= 0.0 and self.lasts_s > 0.0):
-            raise PoiseError(
-                "a pull begins at 0 s or later and lasts some time", "pull", code="out-of-range"
-            )
+        validate(self, "pull")
+        if not any(self.direction):
+            raise PoiseError("a pull needs a direction, got three times 0", "pull", code="out-of-range")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The force at the hand's centre of mass."""
@@ -207,18 +186,13 @@ class Throws:
         seed: of the draws.
     """
 
-    mass: float = 1.0
-    speed: tuple[float, float] = (2.0, 3.0)
-    every_s: tuple[float, float] = (1.0, 1.5)
+    mass: Annotated[float, Range(0, 100, above=True, below=True, unit="kg")] = 1.0
+    speed: Annotated[tuple[float, float], Range(0, above=True, rising=True, unit="m/s")] = (2.0, 3.0)
+    every_s: Annotated[tuple[float, float], Range(0, above=True, rising=True, unit="s")] = (1.0, 1.5)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.mass < 100.0:
-            raise PoiseError(
-                f"a ball must weigh above 0 and below 100 kg, got {self.mass:g}",
-                "throws",
-                code="out-of-range",
-            )
+        validate(self, "throws")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """A ball that waits far off, touches of each body, and throws; "hit" is metered."""
@@ -255,17 +229,11 @@ class Trampoline:
         first: s, when the first bounce begins.
     """
 
-    height: float = 0.15
-    first: float = 1.0
+    height: Annotated[float, Range(0, 1, unit="m")] = 0.15
+    first: Annotated[float, Range(0, EVERY_S, below=True, unit="s")] = 1.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.height <= 1.0:
-            raise PoiseError(
-                f"a bounce is 0 to 1 m high, got {self.height:g}", "trampoline", code="out-of-range"
-            )
-        if not 0.0 <= self.first < EVERY_S:
-            what = f"the first bounce begins within {EVERY_S:g} s, got {self.first:g}"
-            raise PoiseError(what, "trampoline", code="out-of-range")
+        validate(self, "trampoline")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The plate in place of the floor, its bounces, and the feet's contacts."""

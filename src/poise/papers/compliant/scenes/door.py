@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from poise.env.things import SetDown
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
 from poise.papers.compliant.scenes.stage import Stage, hand_of
+from poise.settings import Range, validate
 from poise.sim import Link, SceneSim
 from poise.sim.props import Door
 
@@ -49,18 +51,12 @@ class Doorway:
             character learn at 1 m and try up to 1.7.
     """
 
-    width: float = 1.0
-    weight: float = 20.0
-    made_for: float | None = None
+    width: Annotated[float, Range(0, 10, above=True, below=True, unit="m")] = 1.0
+    weight: Annotated[float, Range(0, 1000, above=True, below=True, unit="kg")] = 20.0
+    made_for: Annotated[float, Range(0.5, 3, unit="m")] | None = None
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.width < 10.0 and 0.0 < self.weight < 1000.0):
-            what = f"a door is 0 to 10 m wide and weighs 0 to 1000 kg, got {self.width:g} m"
-            raise PoiseError(f"{what} and {self.weight:g} kg", "door", code="out-of-range")
-        if self.made_for is not None and not 0.5 <= self.made_for <= 3.0:
-            raise PoiseError(
-                f"a motion is made for 0.5 to 3 m, got {self.made_for:g}", "door", code="out-of-range"
-            )
+        validate(self, "door")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The door, the weld and the task's terms.
