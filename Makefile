@@ -68,7 +68,7 @@ bench: $(VENV)/.dev
 # be installed, in an environment of its own; without network it is left out, which is no failure.
 DOCS := $(VENV)/docs
 docs: $(VENV)/.installed
-	$(BIN)/python docs/generate.py
+	$(BIN)/python docs/generate.py $(if $(CHECK),--check)
 	$(BIN)/python docs/check_text.py
 	$(BIN)/python docs/check_links.py
 	@if $(DOCS)/bin/mkdocs --version >/dev/null 2>&1 || { $(PYTHON) -m venv $(DOCS) >/dev/null 2>&1 && \

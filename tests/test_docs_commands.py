@@ -27,8 +27,7 @@ from poise.settings import to_toml
 from test_docs import WALK, _commands
 from toy_policy import toy_run
 
-#: What needs a machine of its own, or starts processes and has a test of its own: a GPU, a Ray cluster,
-#: a fleet.
+#: What needs a machine of its own: a GPU, a Ray cluster; and fleets, which have their own tests.
 ELSEWHERE = ("--device cuda", "--address", "poise fleet")
 #: Exit codes of a command that did what it says: done, or done but a motion was lost.
 DONE = (0, 3)
