@@ -38,8 +38,16 @@ from poise.jobs.tracker import Tracker
 from poise.papers.compliant.figures import Measured, measure, slope, throws
 from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
 from poise.papers.compliant.play import play
-from poise.papers.compliant.scenes import Balance, Chicken, Doorway, Hands, PlayScene, Throws, Trampoline
-from poise.papers.compliant.training import Learned, digest_of, shipped
+from poise.papers.compliant.scenes import (
+    Balance,
+    Chicken,
+    DoorScene,
+    HandInHand,
+    PlayScene,
+    Throws,
+    TrampolineScene,
+)
+from poise.papers.compliant.training import LearnedOnTop, digest_of, shipped
 from poise.papers.compliant.watch import PUSHED_S
 from poise.plan import LookaheadConfig
 from poise.score.report import line_plot
@@ -203,7 +211,7 @@ def hands(tracker: Tracker, threads: int) -> dict[str, Any]:
     for name, clip in (("walking", walk), ("standing", None)):
         rows: dict[str, Any] = {}
         for way, given in ways.items():
-            made = play(Hands(), tracker, clip, given, 16, 8.0, threads)
+            made = play(HandInHand(), tracker, clip, given, 16, 8.0, threads)
             rows["without"] = dict(made.stiff)
             rows[way] = dict(made.figures)
         out[name] = rows
@@ -218,7 +226,7 @@ def doors(tracker: Tracker, threads: int) -> dict[str, Any]:
         "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
     }  # fmt: skip
     out: dict[str, Any] = {"episodes": 8}
-    for scene in (Doorway(1.0), *(Doorway(w, made_for=m) for m in (None, 1.0) for w in (1.35, 1.7))):
+    for scene in (DoorScene(1.0), *(DoorScene(w, made_for=m) for m in (None, 1.0) for w in (1.35, 1.7))):
         rows: dict[str, Any] = {}
         for way, given in ways.items():
             made = play(scene, tracker, None, given, 8, threads=threads)
@@ -249,10 +257,13 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
     """Trampoline, ball and chicken fight, each beside its twin that does not give way."""
     learned = shipped("ball", tracker)
     assert learned is not None
-    ball: dict[str, Compliance | Stiffness | Learned | None] = {"linear law": None, "learned": learned}
-    cases: dict[str, tuple[PlayScene, dict[str, Compliance | Stiffness | Learned | None]]] = {
+    ball: dict[str, Compliance | Stiffness | LearnedOnTop | None] = {
+        "linear law": None,
+        "learned": learned,
+    }
+    cases: dict[str, tuple[PlayScene, dict[str, Compliance | Stiffness | LearnedOnTop | None]]] = {
         "trampoline": (
-            Trampoline(), {"level 0.16": Compliance(0.16), "level 0.04": Compliance(0.04)}
+            TrampolineScene(), {"level 0.16": Compliance(0.16), "level 0.04": Compliance(0.04)}
         ),
         "ball": (Balance(), ball),
         "ball, pushed with 50 N": (Balance(pushes=50.0), ball),
@@ -279,8 +290,8 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
             continue
         rows: dict[str, Any] = {}
         for way, given in ways.items():
-            own = given if isinstance(given, Learned) else None
-            how = None if isinstance(given, Learned) else given
+            own = given if isinstance(given, LearnedOnTop) else None
+            how = None if isinstance(given, LearnedOnTop) else given
             seconds = 20.0 if isinstance(scene, Balance) else 8.0
             by = at_rate(tracker, 600.0) if "600 Hz" in name else tracker
             made = play(scene, by, None, how, 8, seconds, threads, learned=own)
@@ -300,7 +311,7 @@ def flips(tracker: Tracker, file: Path, threads: int) -> dict[str, Any]:
     clip, out = read_clip(file), dict[str, Any]()
     for height in (0.0, 0.05, 0.1, 0.15):
         rows = out[f"bounce of {height:g} m"] = dict[str, Any]()
-        scene = Trampoline(height, first=PUSH_OFF_S)
+        scene = TrampolineScene(height, first=PUSH_OFF_S)
         for controller in ("policy", "lookahead"):
             made = play(scene, tracker, clip, None, 8, 8.0, threads, controller=controller)
             rows[controller] = dict(made.figures)

@@ -21,7 +21,7 @@ from poise.jobs.library.folder import library_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.cvae import Frames
+from poise.learn.cvae import PackedFrames
 from poise.synthesis.generator import features_of
 
 #: Frames of a past and of its future, 1 s and 2 s.
@@ -138,7 +138,7 @@ def motions_of(clips: Clips, rows: Sequence[int], tracker: Tracker) -> Motions:
     pasts = [q[i : i + PAST] for q in qpos for i in range(0, len(q) - PAST, PAST)]
     angles = torch.cat(qpos)[:, 7:]
     return Motions(
-        Frames(frames, first), torch.stack(pasts), torch.stack((angles.amin(0), angles.amax(0))),
+        PackedFrames(frames, first), torch.stack(pasts), torch.stack((angles.amin(0), angles.amax(0))),
         reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate,
         tuple(clips.names[k] for k in rows),
     )  # fmt: skip

@@ -31,14 +31,14 @@ from poise.errors import PoiseError
 from poise.jobs.inbetween.training import Inbetween, Task, begin, train
 from poise.learn.between import BetweenConfig
 from poise.learn.inbetween import MODEL, Adaptation, BlockStats, InbetweenModel, adapt, load_model
-from poise.learn.transition import Filled, Known
+from poise.learn.transition import FilledGap, Known
 from poise.metrics import physics
 from poise.score.gaps import (
     BANDAI,
     BANDAI_TAKES,
     LAFAN1,
+    GapRow,
     Protocol,
-    Row,
     TestSet,
     evaluate,
     predict,
@@ -59,16 +59,18 @@ _ENOUGH = 128
 _LENGTH = 30
 
 
-def truth_rows(test: TestSet) -> list[Row]:
+def truth_rows(test: TestSet) -> list[GapRow]:
     """The recorded motion's own figures: zero errors, and its FP, FQ, JQ and SM."""
     rows = []
     for n in test.protocol.lengths:
         pos = test.truth(n)[0]
-        rows.append(Row(n, 0.0, 0.0, 0.0, *physics(pos, test.feet, test.fps), 0.0, slide(test, pos, n)))
+        rows.append(
+            GapRow(n, 0.0, 0.0, 0.0, *physics(pos, test.feet, test.fps), 0.0, slide(test, pos, n))
+        )
     return rows
 
 
-def markdown(name: str, methods: Mapping[str, Sequence[Row]]) -> str:
+def markdown(name: str, methods: Mapping[str, Sequence[GapRow]]) -> str:
     """One table per figure, methods down and lengths across, under the name of the data."""
     figures = {
         "L2P": ("l2p", "{:.3f}"), "L2Q": ("l2q", "{:.3f}"), "NPSS": ("npss", "{:.4f}"),
@@ -148,7 +150,7 @@ def choose_iterations(
     net: torch.nn.Module,
     known: Known,
     length: int,
-    score: Callable[[Filled], float],
+    score: Callable[[FilledGap], float],
     config: Adaptation | None = None,
     most: int = 7,
 ) -> tuple[int, tuple[float, ...]]:
@@ -166,7 +168,7 @@ def choose_iterations(
             own.fill(Known(*(x[low : low + config.batch] for x in known)), length)  # type: ignore[operator]
             for low in range(0, len(known.target_root), config.batch)
         ]
-        return score(Filled(*(torch.cat(x) for x in zip(*filled, strict=True))))
+        return score(FilledGap(*(torch.cat(x) for x in zip(*filled, strict=True))))
 
     scores = [scored(net)]
     steps = Adaptation(**{**config.__dict__, "iterations": most})
@@ -192,7 +194,7 @@ def _ratio(value: float, before: float) -> float:
 
 def adapted_rows(
     model: InbetweenModel, held: TestSet, test: TestSet
-) -> tuple[list[Row], dict[str, dict]]:
+) -> tuple[list[GapRow], dict[str, dict]]:
     """Rows after adaptation to the whole test set of each length, and what was chosen and its cost: one
     setting at `_LENGTH`, and the iterations at each length."""
     rows, notes = [], {}
@@ -269,12 +271,12 @@ def part_of(task: Task, part: str) -> TestSet:
     return test_set(protocol.split(task.bank, "final"), std, protocol)
 
 
-def mean_rows(all_rows: list[list[Row]]) -> list[Row]:
+def mean_rows(all_rows: list[list[GapRow]]) -> list[GapRow]:
     """Means over seeds, figure by figure."""
     out = []
     for rows in zip(*all_rows, strict=True):
         means = {k: sum(getattr(r, k) for r in rows) / len(rows) for k in dataclasses.asdict(rows[0])}
-        out.append(Row(**{**means, "length": rows[0].length}))
+        out.append(GapRow(**{**means, "length": rows[0].length}))
     return out
 
 
@@ -300,7 +302,7 @@ def main() -> None:
     found: dict = {"name": protocol.name, "part": args.part, "runs": {}}
     if args.out.exists() and (old := json.loads(args.out.read_text())).get("part") == args.part:
         found["runs"] = old.get("runs", {}) if old.get("name") == protocol.name else {}
-    table: dict[str, list[Row]] = {}
+    table: dict[str, list[GapRow]] = {}
     folder = args.work / protocol.name / f"{args.nets[0]}-{args.seeds[0]}"
     first = settings(protocol, args.nets[0], args.seeds[0], args)
     task, _ = begin(folder, args.library, first, args.minutes, args.steps)
@@ -322,12 +324,12 @@ def main() -> None:
         for kind, suffix in (("rows", ""), ("tta", " + TTA")):
             runs = [found["runs"][f"{net}-{s}"].get(kind) for s in args.seeds]
             if all(runs):
-                table[net + suffix] = mean_rows([[Row(**r) for r in rows] for rows in runs])
+                table[net + suffix] = mean_rows([[GapRow(**r) for r in rows] for rows in runs])
         write_table(args.out.with_suffix(".md"), table, found)
     print(args.out)
 
 
-def write_table(path: Path, table: dict[str, list[Row]], found: dict) -> None:
+def write_table(path: Path, table: dict[str, list[GapRow]], found: dict) -> None:
     """The table and the costs as markdown."""
     head = f"{found['name']}, {found['part']} part, {found['windows']} windows"
     lines = [f"# In-betweening: {head}", "", f"Clips: {found['clips']}. {found['machine']}.", ""]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.learn.transition import Filled, Known, Layout
+from poise.learn.transition import FilledGap, Known, SkeletonLayout
 from poise.motion.rotations import forward_kinematics
 
 #: Under this distance of the dot product from 1 the published slerp is a plain weighted sum.
@@ -22,7 +22,7 @@ class Baseline:
     hemisphere, weights in float32, and nearly equal quaternions by an unnormalised LERP.
     """
 
-    def __init__(self, kind: str, layout: Layout):
+    def __init__(self, kind: str, layout: SkeletonLayout):
         if kind not in ("zero-velocity", "interpolation"):
             raise ValueError(f"there is no baseline '{kind}'")
         self.kind, self.layout = kind, layout
@@ -31,7 +31,7 @@ class Baseline:
         """None."""
         return []
 
-    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> Filled:
+    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> FilledGap:
         """`length` frames after the last known one; see `learn.transition.TransitionNet`."""
         a, qa = known.past_root[:, -1:], known.past_rot[:, -1:]
         if self.kind == "zero-velocity":
@@ -43,7 +43,7 @@ class Baseline:
             rot = protocol_slerp(qa, known.target_rot.unsqueeze(1), t[:, None])
         pos, _ = forward_kinematics(self.layout.parents, known.offsets[:, None], root, rot)
         contact = torch.zeros(*root.shape[:2], len(self.layout.feet), dtype=root.dtype)
-        return Filled(root, rot, contact, pos)
+        return FilledGap(root, rot, contact, pos)
 
 
 def protocol_slerp(a: Tensor, b: Tensor, t: Tensor) -> Tensor:

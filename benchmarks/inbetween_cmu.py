@@ -28,8 +28,8 @@ from poise.jobs.inbetween.training import Inbetween, Task, begin, train
 from poise.jobs.library.clips import LibraryConfig
 from poise.learn.between import BetweenConfig, BetweenTraining
 from poise.learn.inbetween import Adaptation, BlockStats, InbetweenModel, adapt, load_model, save_model
-from poise.learn.transition import Filled
-from poise.score.gaps import Row, TestSet, evaluate, score, test_set
+from poise.learn.transition import FilledGap
+from poise.score.gaps import GapRow, TestSet, evaluate, score, test_set
 
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, boxing and exercises of 14,
 #: walks of 38, 39 and 43. The figures are of these.
@@ -119,21 +119,21 @@ def figures(model: InbetweenModel, task: Task, ways: dict[str, Adaptation]) -> d
     }  # fmt: skip
 
 
-def plain(rows: dict[str, list[Row]]) -> dict[str, list[dict]]:
+def plain(rows: dict[str, list[GapRow]]) -> dict[str, list[dict]]:
     """As JSON has it."""
     return {k: [dataclasses.asdict(r) for r in v] for k, v in rows.items()}
 
 
 def adapted(
     model: InbetweenModel, choices: TestSet, final: TestSet, way: Adaptation
-) -> tuple[list[Row], dict[str, int]]:
+) -> tuple[list[GapRow], dict[str, int]]:
     """Rows after adaptation to all windows of each length, and how many iterations were chosen."""
     few = some_of(choices, 40)
     rows, counts = [], {}
     for n in LENGTHS:
         before = evaluate(model.net, few, (n,))[0]
 
-        def worth(filled: Filled, n: int = n, before: Row = before) -> float:
+        def worth(filled: FilledGap, n: int = n, before: GapRow = before) -> float:
             """Less slide is worth no more than a hundredth of L2P."""
             now = score(few, filled, n)
             return now.slide_mm if now.l2p <= 1.01 * before.l2p else float("inf")

@@ -35,7 +35,7 @@ from poise.jobs.inbetween.fill import shipped_model
 from poise.jobs.inbetween.training import Task, begin
 from poise.kinematics.feet import standing_labels
 from poise.learn.inbetween import InbetweenModel, adapt, load_model
-from poise.learn.transition import Filled
+from poise.learn.transition import FilledGap
 from poise.metrics import l2p
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import forward_kinematics, normalize
@@ -142,7 +142,7 @@ def adaptation(model: InbetweenModel, choices: TestSet, final: TestSet) -> dict[
     out: dict[str, Any] = {"before": asdict(evaluate(model.net, final, (n,))[0])}
     before = evaluate(model.net, few, (n,))[0]
 
-    def worth(filled: Filled) -> float:
+    def worth(filled: FilledGap) -> float:
         """Less slide is worth no more than a hundredth of L2P."""
         now = score(few, filled, n)
         return now.slide_mm if now.l2p <= 1.01 * before.l2p else float("inf")

@@ -26,7 +26,7 @@ from poise.errors import PoiseError
 from poise.live.commands import command, parse
 from poise.live.page.server import PageServer
 from poise.live.sockets import Guard, StreamDoor
-from poise.live.sources import Frame, JsonStream
+from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox
 from poise.live.vmc import VmcSource, datagram, standard
 
@@ -75,7 +75,7 @@ class Keep:
     def __init__(self) -> None:
         self.taken = 0
 
-    def offer(self, frame: Frame) -> None:
+    def offer(self, frame: KeypointFrame) -> None:
         """Takes one."""
         assert not np.isinf(frame.points).any() and np.isfinite(frame.time_s)
         self.taken += 1

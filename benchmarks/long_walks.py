@@ -22,7 +22,7 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import imitation_of
-from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.placement import PlacedMotion, place
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 
@@ -30,7 +30,7 @@ from poise.learn.checkpoint import write_atomic
 PIECE_S = 20.0
 
 
-def pieces(folder: Path, tracker: Tracker, minutes: float, seed: int) -> list[Placed]:
+def pieces(folder: Path, tracker: Tracker, minutes: float, seed: int) -> list[PlacedMotion]:
     """A motion of so many minutes, cut into pieces on the policy's body."""
     files = sorted(p for p in folder.iterdir() if p.suffix in (".amc", ".bvh"))
     long, out, count = joined([read_clip(p) for p in files], minutes, seed), [], round(PIECE_S * RATE)

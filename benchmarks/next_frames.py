@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.learn.cvae import Frames
+from poise.learn.cvae import PackedFrames
 from poise.settings import validate
 from poise.synthesis.generator import coordinates, past_features
 
@@ -177,7 +177,7 @@ class NextFrameObjective:
         """What is trained, by name."""
         return {"net": self.net}
 
-    def step(self, sampler: Frames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def step(self, sampler: PackedFrames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         """One update; the loss."""
         window = self.net.config.past + self.net.config.future
         x = self.net.scaled(sampler.draw(self.batch, window, generator))

@@ -27,7 +27,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
-from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.placement import PlacedMotion, place
 from poise.jobs.tracker import Tracker
 from poise.learn import PolicyBundle
 from poise.learn.checkpoint import write_atomic
@@ -86,7 +86,7 @@ def spectrum(pos: Tensor) -> Tensor:
 
 @torch.no_grad()
 def measure(
-    tracker: Tracker, placed: list[Placed], noise: float, seed: int, velocities: bool = False
+    tracker: Tracker, placed: list[PlacedMotion], noise: float, seed: int, velocities: bool = False
 ) -> dict[str, Any]:
     """One way of doing all clips."""
     imitation = imitation_of(tracker, placed)
@@ -133,7 +133,7 @@ def main() -> None:
     said: dict[str, Any] = json.loads(a.json.read_text()) if a.json.exists() else {}
     rows: dict[str, Any] = said.setdefault("rows", {})
     for name, tracker in trackers.items():
-        placed: list[Placed] = []
+        placed: list[PlacedMotion] = []
         for file in sorted(a.clips.glob("*.bvh"))[:: a.every]:
             try:
                 placed.append(place(read_clip(file), tracker))

@@ -20,7 +20,7 @@ import torch
 from poise.env import Reference
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import Keeper, imitation_of
+from poise.jobs.track import ResetOnFail, imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.track.supports import crowd
 from poise.jobs.tracker import Tracker
@@ -42,7 +42,7 @@ def measure(tracker: Tracker, data: Path, apart: float, together: bool) -> dict[
     env = replace(task, reference=reference).env(
         None if together else count, None, False, 1, help_scale=0.0, backend=rows
     )
-    keeper = Keeper(env, tracker.policy)
+    keeper = ResetOnFail(env, tracker.policy)
     obs = env.reset_to(torch.arange(count), torch.zeros(count, dtype=torch.long))
     lengths = reference.length
     steps = int(lengths.min()) - 1

@@ -92,12 +92,12 @@ def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an untrained in-betweening network for the embedded walk."""
     from poise.formats import read_clip
     from poise.learn.inbetween import MODEL, InbetweenModel, make_net, save_model
-    from poise.learn.transition import Layout
+    from poise.learn.transition import SkeletonLayout
     from poise.motion.windows import pack_frames
     from toy_windows import SMALL
 
     bank = pack_frames([read_clip(WALK)])
-    made = make_net("transformer", Layout(bank.parents, bank.feet, bank.facing), SMALL, 0)
+    made = make_net("transformer", SkeletonLayout(bank.parents, bank.feet, bank.facing), SMALL, 0)
     made.calibrate(*(x[None].float() for x in (bank.root, bank.rot)), bank.offsets.float())
     folder = tmp_path_factory.mktemp("net")
     model = InbetweenModel("transformer", made, bank.names, bank.offsets[0].float(), 30.0, 60)

@@ -8,7 +8,7 @@ import torch
 
 from poise.learn.between import BetweenConfig
 from poise.learn.rtn import RTNConfig
-from poise.learn.transition import Known, Layout
+from poise.learn.transition import Known, SkeletonLayout
 from poise.learn.windows import FrameData
 from poise.motion.windows import FrameBank, pack_frames, step_contacts, train_statistics
 from toy_human import swing
@@ -22,8 +22,8 @@ def bank() -> FrameBank:
     return pack_frames(clips)
 
 
-def layout(of: FrameBank) -> Layout:
-    return Layout(of.parents, of.feet, of.facing)
+def layout(of: FrameBank) -> SkeletonLayout:
+    return SkeletonLayout(of.parents, of.feet, of.facing)
 
 
 def data(of: FrameBank) -> FrameData:

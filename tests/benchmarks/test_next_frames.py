@@ -6,7 +6,7 @@ import pytest
 import torch
 from next_frames import NextFrame, NextFrameConfig, NextFrameObjective, NextFrames
 
-from poise.learn.cvae import Frames
+from poise.learn.cvae import PackedFrames
 from poise.learn.inbetween import InbetweenTrainer
 from poise.synthesis.generator import ROOT
 from refusals import refused
@@ -56,7 +56,7 @@ def test_frames_of_its_own_stand_where_it_is_to_see_them() -> None:
 
 @pytest.mark.parametrize("name", SMALL)
 def test_they_learn_and_go_on(name: str) -> None:
-    frames = Frames(swinging(), torch.tensor([0, 400]))
+    frames = PackedFrames(swinging(), torch.tensor([0, 400]))
     net = made(SMALL[name])
     net.calibrate(frames.frames)
     trainer = InbetweenTrainer(NextFrameObjective(net, 16, 3e-3), frames, steps=150, batch=16, ema=0.0)

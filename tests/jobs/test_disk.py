@@ -17,7 +17,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.text import write_whole
 from poise.jobs.open import open_run
-from poise.jobs.result import Result, Shown
+from poise.jobs.result import Result, ResultView
 from poise.jobs.runs import train
 from poise.learn import Until
 from poise.motion import Clip, trim
@@ -137,9 +137,9 @@ class _Made(Result):
     def __init__(self, fails: bool = False) -> None:
         self.fails = fails
 
-    def _shown(self) -> Shown:
+    def _shown(self) -> ResultView:
         clip = trim(read_clip(WALK), 0, 3)
-        return Shown(clip, clip, None, ())
+        return ResultView(clip, clip, None, ())
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         if self.fails:

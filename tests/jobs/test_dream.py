@@ -15,7 +15,7 @@ import torch
 from poise.formats import read_clip
 from poise.jobs.endless import dreamt as frames
 from poise.jobs.endless.dreaming import begun, dream, past_of
-from poise.jobs.endless.dreamt import NUMBER, Body, Dream, FrameStore, MotionWriter, Pieces
+from poise.jobs.endless.dreamt import NUMBER, ClipMaker, Dream, FrameStore, MotionWriter, Pieces
 from poise.jobs.endless.model import GeneratorModel
 from poise.jobs.endless.training import Endless, motions_of, train_generator
 from poise.jobs.open import open_run
@@ -157,7 +157,7 @@ def test_pieces_are_one_motion(
     monkeypatch.setattr(frames, "SHARED", 8)
     qpos = place(walk(), tracker).qpos
     store = FrameStore(qpos.shape[1])
-    body = Body(tracker.humanoid.table, tracker.example, 30.0)
+    body = ClipMaker(tracker.humanoid.table, tracker.example, 30.0)
     writer = MotionWriter(tmp_path / "walk.bvh", tracker.example, len(qpos))
     pieces = Pieces(store, body, writer.add, "walk", hold=False)
     for row in qpos:

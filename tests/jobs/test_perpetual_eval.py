@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv
-from poise.jobs.perpetual.evaluation import History, evaluate_clips
+from poise.jobs.perpetual.evaluation import EvaluationLog, evaluate_clips
 from poise.jobs.perpetual.stage_start import Owners
 from poise.learn import PolicyBundle, compose, first_column, next_column
 from poise.learn.primitives import primitive
@@ -106,14 +106,14 @@ def test_the_hardest_are_those_that_fail_first() -> None:
 
 def test_the_table_of_a_resumed_run_has_no_row_twice(tmp_path: Path) -> None:
     names = ("a", "b")
-    table = History(tmp_path, names)
+    table = EvaluationLog(tmp_path, names)
     for iteration in (1, 2, 3):
         table.add(iteration, "primitive 1", 12.5, results([True, False], [10, 4]))
     table.add(3, "final", 0.0, results([True, True], [10, 10]))
     whole = table.path.read_text()
     with table.path.open("a") as file:
         file.write("4,primi")
-    again = History(tmp_path, names, last=2)
+    again = EvaluationLog(tmp_path, names, last=2)
     assert len(again.path.read_text().splitlines()) == 1 + 2 * 2
     again.add(3, "primitive 1", 12.5, results([True, False], [10, 4]))
     again.add(3, "final", 0.0, results([True, True], [10, 10]))

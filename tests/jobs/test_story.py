@@ -12,7 +12,7 @@ import torch
 from test_best import episodes
 
 from poise.jobs.track import controllers
-from poise.jobs.track.controllers import Done, Merit, done_by, merit
+from poise.jobs.track.controllers import Merit, TrackingRun, done_by, merit
 from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.tracked import story
 from poise.metrics import success_rule
@@ -23,14 +23,16 @@ from poise.score.rollouts import judge
 FRAMES = 40
 
 
-def done(fail: int | None, by: str) -> Done:
+def done(fail: int | None, by: str) -> TrackingRun:
     """An episode that is lost at a frame, or not."""
     rollouts = episodes(fail, frames=FRAMES)
     judged = judge(rollouts, success_rule("phc"))
-    return Done(rollouts, [SimpleNamespace(row=0)], judged, [] if fail is None else [(0, fail)], by)  # type: ignore[list-item]
+    return TrackingRun(
+        rollouts, [SimpleNamespace(row=0)], judged, [] if fail is None else [(0, fail)], by
+    )  # type: ignore[list-item]
 
 
-def tracked(kept: Done, **more: Any) -> Any:
+def tracked(kept: TrackingRun, **more: Any) -> Any:
     """As much of a result as a story reads."""
     card, rate = score_rollouts(kept.rollouts), 30.0
     reference = SimpleNamespace(length=torch.tensor([FRAMES]), rate_hz=rate)

@@ -17,7 +17,7 @@ from poise.formats.point_fit import JOINT_PLACES
 from poise.formats.raw import ReadOptions as Options
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
-from poise.jobs.track import Keeper, TrackConfig, imitation_of, look_ahead, track, write
+from poise.jobs.track import ResetOnFail, TrackConfig, imitation_of, look_ahead, track, write
 from poise.jobs.track.controllers import NO_CRITIC
 from poise.jobs.track.placement import home, place, points_of
 from poise.jobs.tracker import Tracker
@@ -173,7 +173,7 @@ def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
     placed = [place(walk(0, 40), tracker), place(walk(20, 60), tracker)]
     imitation = imitation_of(tracker, placed)
     env = imitation.env(2, auto_reset=False, threads=1, help_scale=0.0)
-    keeper = Keeper(env, tracker.policy)
+    keeper = ResetOnFail(env, tracker.policy)
     try:
         obs = env.reset_to(torch.tensor([0, 1]), torch.zeros(2, dtype=torch.long))
         for _ in range(3):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from poise.learn.between import Between, BetweenConfig, Dropout, carried, last_before_gap, neighbours
-from poise.learn.transition import Layout, joint_positions
+from poise.learn.transition import SkeletonLayout, joint_positions
 from poise.motion.rotations import quat_rotate, slerp
 from refusals import refused
 from toy_windows import SMALL, bank, known, layout, moved
@@ -154,7 +154,7 @@ def test_dropout_leaves_channels_out_of_whole_windows() -> None:
 
 
 def test_sizes() -> None:
-    chains = Layout((-1, *range(21)), (1, 2, 3, 4), (1.0, 0.0, 0.0))
+    chains = SkeletonLayout((-1, *range(21)), (1, 2, 3, 4), (1.0, 0.0, 0.0))
     g = torch.Generator().manual_seed(0)
     weights = sum(p.numel() for p in Between(chains, generator=g).parameters())
     assert 4e6 < weights < 10e6

@@ -78,16 +78,16 @@ def test_the_truth_has_no_loss_and_slides_where_contact_is_said() -> None:
     batch = Sampler(frames).at(torch.tensor([3]), 20)
     known = torch.ones(20, dtype=torch.bool)
     known[10:19] = False
-    from poise.learn.between import Gap
+    from poise.learn.between import GapFrames
     from poise.motion.rotations import matrix_kinematics, quat_to_matrix
 
     mats = quat_to_matrix(batch.rot)
     truth = matrix_kinematics(frames.layout.parents, batch.offsets.unsqueeze(1), batch.root, mats)
     logits = torch.full((1, 20, 4), -30.0, requires_grad=True)
-    parts = learner._parts(Gap(batch.root, mats, logits), truth, batch, known)
+    parts = learner._parts(GapFrames(batch.root, mats, logits), truth, batch, known)
     for name in ("pos", "quat", "velocity"):
         assert float(parts[name]) == pytest.approx(0.0, abs=2e-4)
-    sure = Gap(batch.root, mats, torch.full((1, 20, 4), 30.0, requires_grad=True))
+    sure = GapFrames(batch.root, mats, torch.full((1, 20, 4), 30.0, requires_grad=True))
     moved = learner._parts(sure, truth, batch, known)["slide"]
     step = torch.diff(truth[0][:, :, list(frames.layout.feet)], dim=1)[:, 9:19].norm(dim=-1)
     held = torch.ones(10, 4)

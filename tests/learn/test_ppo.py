@@ -11,7 +11,7 @@ from poise.learn import (
     PPO,
     PPOConfig,
     Rollout,
-    Step,
+    StepResult,
     Trainer,
     Until,
     load_policy,
@@ -201,7 +201,7 @@ class Faulty(PointEnv):
 
     broken = "reward"
 
-    def step(self, actions: torch.Tensor) -> Step:
+    def step(self, actions: torch.Tensor) -> StepResult:
         step = super().step(actions)
         self.steps = getattr(self, "steps", 0) + 1
         if self.steps == 20:

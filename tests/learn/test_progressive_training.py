@@ -17,7 +17,7 @@ from poise.learn import (
     CloneConfig,
     PolicyBundle,
     PPOConfig,
-    Step,
+    StepResult,
     Trainer,
     Until,
     WarmStart,
@@ -214,12 +214,12 @@ class Bandit(PointEnv):
     def _obs(self) -> Tensor:
         return self.p
 
-    def step(self, actions: Tensor) -> Step:
+    def step(self, actions: Tensor) -> StepResult:
         error = actions[:, 0] - self.p[:, 0].sign()
         done = torch.ones(self.num_envs, dtype=torch.bool)
         final = self._obs().clone()
         self._restart(done.nonzero().squeeze(-1))
-        return Step(self._obs(), (-(error**2)).exp(), done, ~done, final, {"error": 0.0})
+        return StepResult(self._obs(), (-(error**2)).exp(), done, ~done, final, {"error": 0.0})
 
 
 def worth(bundle: PolicyBundle, seed: int = 5) -> float:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from poise.learn.rtn import PLU, RTN, Critic, RTNConfig, arrival_embedding, noise_scale
-from poise.learn.transition import Layout
+from poise.learn.transition import SkeletonLayout
 from poise.motion.rotations import quat_rotate
 from toy_windows import SMALL_RTN, bank, known, layout, moved
 
@@ -39,7 +39,7 @@ def test_the_arrival_embedding_and_the_schedule_of_noise() -> None:
 
 
 def test_sizes_are_those_that_follow_from_the_paper() -> None:
-    chains = Layout((-1, *range(21)), (1, 2, 3, 4), (1.0, 0.0, 0.0))
+    chains = SkeletonLayout((-1, *range(21)), (1, 2, 3, 4), (1.0, 0.0, 0.0))
     g = torch.Generator().manual_seed(0)
     for width, millions in ((512, 3.6), (768, 5.8), (1024, 8.6)):
         net = RTN(chains, RTNConfig(hidden=width), generator=g)

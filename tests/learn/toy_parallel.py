@@ -13,7 +13,7 @@ from toy_point_env import PointEnv
 
 import poise.learn.rollout
 from poise.errors import PoiseError
-from poise.learn import PPOConfig, Step, Trainer, Until, run
+from poise.learn import PPOConfig, StepResult, Trainer, Until, run
 from poise.learn.networks import GaussianPolicy
 from poise.learn.parallel import ALONE, Comm, joined, rank_seed
 
@@ -44,10 +44,10 @@ class TwinEnv(PointEnv):
     def reset(self) -> Tensor:
         return torch.cat([part.reset() for part in self.parts])
 
-    def step(self, actions: Tensor) -> Step:
+    def step(self, actions: Tensor) -> StepResult:
         a, b = (part.step(x) for part, x in zip(self.parts, actions.chunk(2), strict=True))
         log = {k: (a.log[k] + b.log[k]) / 2 for k in a.log}
-        return Step(*(torch.cat([x, y]) for x, y in zip(a[:5], b[:5], strict=True)), log)
+        return StepResult(*(torch.cat([x, y]) for x, y in zip(a[:5], b[:5], strict=True)), log)
 
 
 def twin_draws(
@@ -72,7 +72,7 @@ def twin_draws(
 def trainer(comm: Comm = ALONE, config: PPOConfig = TOY, seed: int = 3, bad_rank: int = -1) -> Trainer:
     env = PointEnv(ENVS // comm.size, rank_seed(seed, comm.rank))
     if comm.rank == bad_rank:
-        env.step = lambda actions: Step(  # type: ignore[method-assign]
+        env.step = lambda actions: StepResult(  # type: ignore[method-assign]
             *PointEnv.step(env, actions * torch.nan)
         )
     return Trainer(env, config, seed, character="point", comm=comm)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.learn import Step
+from poise.learn import StepResult
 
 LIMIT = 20  # Control steps until the time-out.
 
@@ -37,7 +37,7 @@ class PointEnv:
         self._restart(torch.arange(self.num_envs))
         return self._obs()
 
-    def step(self, actions: Tensor) -> Step:
+    def step(self, actions: Tensor) -> StepResult:
         self.p += 0.2 * actions
         self.clock += 1
         distance = (self.p - self.target).norm(dim=-1)
@@ -46,7 +46,7 @@ class PointEnv:
         final = self._obs()
         self._restart((terminated | truncated).nonzero().squeeze(-1))
         log = {"distance": float(distance.mean())}
-        return Step(self._obs(), (-(distance**2)).exp(), terminated, truncated, final, log)
+        return StepResult(self._obs(), (-(distance**2)).exp(), terminated, truncated, final, log)
 
     def state(self) -> dict[str, Tensor]:
         return {

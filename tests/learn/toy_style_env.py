@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from toy_point_env import PointEnv
 
-from poise.learn import Step
+from poise.learn import StepResult
 
 FRAMES = 4
 
@@ -22,7 +22,7 @@ class StyleEnv(PointEnv):
         self.moved = torch.zeros(num_envs, 4)
         self.asked: list[Tensor] = []
 
-    def step(self, actions: Tensor) -> Step:
+    def step(self, actions: Tensor) -> StepResult:
         before = self.p.clone()
         step = super().step(actions)
         reached = step.final_obs[:, :2]

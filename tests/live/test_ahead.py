@@ -11,7 +11,7 @@ import torch
 
 from poise.jobs.open import open_run
 from poise.live.lookahead import LEAD, QUICK, AheadBeside, tries_of
-from poise.live.world import World
+from poise.live.world import LiveWorld
 from refusals import refused
 
 
@@ -27,7 +27,7 @@ def decisions(ahead: AheadBeside, count: int, step: Callable[[], object]) -> int
 
 def test_a_decision_begins_with_what_is_done_meanwhile() -> None:
     tracker = open_run(None).tracker
-    world, lookahead = World(tracker), tries_of(tracker, QUICK, 0)
+    world, lookahead = LiveWorld(tracker), tries_of(tracker, QUICK, 0)
     world.step(world.characters[0].ease[None])
     snapshot, past = world.env.snapshot(torch.tensor([0])), world.env.pose().pos[:, None][0]
     meanwhile = torch.full((LEAD, world.env.num_actions), 0.01)
@@ -40,7 +40,7 @@ def test_a_decision_begins_with_what_is_done_meanwhile() -> None:
 
 def test_the_loop_goes_on_while_another_process_decides_and_after_its_end() -> None:
     tracker = open_run(None).tracker
-    world = World(tracker, 2, lookahead=(0,), beside=True)
+    world = LiveWorld(tracker, 2, lookahead=(0,), beside=True)
     ahead = world._ahead
     assert isinstance(ahead, AheadBeside)
     ease = torch.stack([c.ease for c in world.characters])
@@ -79,7 +79,7 @@ def test_a_policy_without_critic_is_refused() -> None:
 
     tracker = replace(open_run(None).tracker, value=None)
     with refused("critic-missing"):
-        World(tracker, lookahead=(0,))
-    world = World(tracker)
+        LiveWorld(tracker, lookahead=(0,))
+    world = LiveWorld(tracker)
     assert not world.can_look_ahead
     world.close()

@@ -9,7 +9,15 @@ from torch import Tensor
 from poise.env.recovery.clips import GetUpPlanner
 from poise.env.recovery.planner import walk_of
 from poise.jobs.open import open_run
-from poise.live.characters import EASE, PASSES_S, RETURNS, SPEEDS_UP, TRACKS, Body, Character
+from poise.live.characters import (
+    EASE,
+    PASSES_S,
+    RETURNS,
+    SPEEDS_UP,
+    TRACKS,
+    CharacterGoals,
+    CharacterState,
+)
 from poise.motion.rotations import facing
 
 RATE = 30.0
@@ -39,17 +47,17 @@ def get_up() -> GetUpPlanner:
     return GetUpPlanner(tracker.recovery_clips, tracker.humanoid.table, RATE)
 
 
-def followed(get_up: GetUpPlanner, speed: float) -> tuple[Character, Person]:
+def followed(get_up: GetUpPlanner, speed: float) -> tuple[CharacterGoals, Person]:
     # As a walk along x faces.
     ease = facing(get_up.recovery_clips.ease, walk_of(get_up, 0)[2])
     person = Person(speed, ease)
-    character = Character(get_up, (0.0, 0.0), move=person.put)
+    character = CharacterGoals(get_up, (0.0, 0.0), move=person.put)
     character.begin(ease)
     return character, person
 
 
-def body_of(frame: Tensor, moves: float = 0.0) -> Body:
-    return Body(frame.clone(), 0.0, moves, torch.tensor([moves, 0.0], dtype=torch.float64))
+def body_of(frame: Tensor, moves: float = 0.0) -> CharacterState:
+    return CharacterState(frame.clone(), 0.0, moves, torch.tensor([moves, 0.0], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.7, 3.0])

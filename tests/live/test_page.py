@@ -24,7 +24,7 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.live.commands import MOST_BYTES, LiveConfig
 from poise.live.page.server import HEAD, PAGES, PageServer, as_json, packed
-from poise.live.session import Session, Wanted
+from poise.live.session import Session, SessionConfig
 from poise.live.sockets import A_SECOND, EACH, Guard
 from poise.live.stream import Inbox
 from refusals import refused
@@ -202,7 +202,7 @@ def test_a_port_that_is_taken_is_told(served: Served) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_push_fall_recovery_and_record_in_chromium(tmp_path: Path) -> None:
-    wanted = Wanted({"walk": read_clip(WALK)}, record=tmp_path / "take.bvh")
+    wanted = SessionConfig({"walk": read_clip(WALK)}, record=tmp_path / "take.bvh")
     session = Session(open_run(None).tracker, LiveConfig(), wanted)
     done = threading.Event()
     steps = threading.Thread(target=lambda: session.live.run(done.is_set))

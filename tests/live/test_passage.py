@@ -9,8 +9,8 @@ import torch
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.kinematics import clip_to_qpos
-from poise.kinematics.retarget.passage import Passage
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.passage import Retargeter
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.live import quats as q
 from poise.live.passage import FramePassage, Hinges, local_of, world_of
 from poise.motion import Clip
@@ -39,7 +39,7 @@ def test_rotations_are_those_of_spatial() -> None:
 def test_a_frame_passes_as_the_clip_does(walk: Clip) -> None:
     tracker = open_run(None).tracker
     one = FramePassage(walk, tracker.example)
-    rot, root = Passage.between(walk, tracker.example).transfer(World.of(walk))
+    rot, root = Retargeter.between(walk, tracker.example).transfer(ClipWorld.of(walk))
     hinges, last = Hinges(tracker.example.skeleton, tracker.humanoid.table), None
     made = []
     for t in range(walk.frames):

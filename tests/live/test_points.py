@@ -25,7 +25,7 @@ from poise.live.passage import world_of
 from poise.live.points import PointFit
 from poise.live.session import Live
 from poise.live.sockets import StreamDoor
-from poise.live.sources import Frame, JsonStream
+from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
 from test_docs import ROOT, WALK
@@ -73,7 +73,7 @@ def test_people_are_measured_and_fitted_at_any_rate(tracker: Tracker, walk: Clip
     names = walk.skeleton.names
     wanted = next(k for k, n in enumerate(names) if "leftfoot" in n.lower())
     for now, points in film(walk, rate, 3.2):
-        fit.fit(Frame("a", names, points, now, now))
+        fit.fit(KeypointFrame("a", names, points, now, now))
         if 1.0 < now < 1.9:
             assert 0.3 < fit.inbox.standing["a"] < 1.0
         for line in fit.inbox.take().values():
@@ -94,7 +94,7 @@ def test_missing_points_leaps_and_other_keypoints(tracker: Tracker, walk: Clip) 
         torn[rng.integers(len(names), size=2) if kind == "torn" and now > 2.2 else []] = np.nan
         if kind == "blind":
             torn[:] = np.nan
-        fit.fit(Frame("a", names, torn + (8.0 if kind == "back" else 0.0), now, now))
+        fit.fit(KeypointFrame("a", names, torn + (8.0 if kind == "back" else 0.0), now, now))
         for line in fit.inbox.take().values():
             for _, packet in line:
                 took[kind] += 1
@@ -102,7 +102,7 @@ def test_missing_points_leaps_and_other_keypoints(tracker: Tracker, walk: Clip) 
     assert took["torn"] > 15 and took["blind"] <= 16 and took["back"] > 5
     assert fit.inbox.refused["keypoints are missing"] > 5
     for k in range(70):
-        fit.fit(Frame("b", ("x", "y"), np.ones((2, 3)), k / 30, k / 30))
+        fit.fit(KeypointFrame("b", ("x", "y"), np.ones((2, 3)), k / 30, k / 30))
     assert fit.inbox.refused["these keypoints show no body"] >= 1
 
 
@@ -151,7 +151,7 @@ class Door:
     """A door whose frames are kept."""
 
     def __init__(self, tracker: Tracker, token: str | None = None):
-        self.fit, self.frames = fitted(tracker), list[Frame]()
+        self.fit, self.frames = fitted(tracker), list[KeypointFrame]()
         self.fit.offer = self.frames.append  # type: ignore[method-assign]
         self.door = StreamDoor("127.0.0.1", 0, self.fit.inbox, self.fit, time.perf_counter, token)
         self.door.start()
@@ -262,8 +262,8 @@ def test_a_policy_of_keypoints_is_told_the_points_and_another_one_the_fit(walk: 
     names, apart, told = walk.skeleton.names, list[float](), 0
     last: np.ndarray | None = None
     for now, points in film(walk, 30.0, 4.5, stands=3.5):
-        fit.fit(Frame("a", names, points, now, now))
-        plain.fit(Frame("a", names, points, now, now))
+        fit.fit(KeypointFrame("a", names, points, now, now))
+        plain.fit(KeypointFrame("a", names, points, now, now))
         (line,) = inbox.take().values() or ([],)
         assert all(p.places is None for _, p in line)
         waiting = live.inbox.take()

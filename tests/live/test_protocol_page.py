@@ -10,7 +10,7 @@ import numpy as np
 
 from poise.live.commands import COMMANDS, command, parse
 from poise.live.page.server import as_json
-from poise.live.sources import Frame, JsonStream
+from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox
 from test_docs import ROOT
 
@@ -30,9 +30,9 @@ def messages() -> list[dict[str, Any]]:
 
 class Kept:
     def __init__(self) -> None:
-        self.frames = list[Frame]()
+        self.frames = list[KeypointFrame]()
 
-    def offer(self, frame: Frame) -> None:
+    def offer(self, frame: KeypointFrame) -> None:
         self.frames.append(frame)
 
 

@@ -15,13 +15,13 @@ import pytest
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.kinematics import clip_to_qpos
-from poise.live.record import Recorder
+from poise.live.record import CharacterRecorder
 from refusals import refused
 
 
-def recorder(path: Path, count: int = 1) -> Recorder:
+def recorder(path: Path, count: int = 1) -> CharacterRecorder:
     t = open_run(None).tracker
-    return Recorder(path, t.humanoid.table, t.example, count, 30.0)
+    return CharacterRecorder(path, t.humanoid.table, t.example, count, 30.0)
 
 
 @pytest.mark.parametrize("suffix", [".bvh", ".glb", ".csv"])

@@ -14,8 +14,8 @@ from poise.live.passage import world_of
 from poise.live.people import Person, Steady
 from poise.live.points import PointFit
 from poise.live.session import _of_tremble
-from poise.live.sources import Frame, Loop
-from poise.live.stream import Inbox, JitterBuffer, Packet, Tremble, margin
+from poise.live.sources import KeypointFrame, Loop
+from poise.live.stream import Inbox, JitterBuffer, Packet, StreamTremble, margin
 from poise.motion import Clip, Skeleton
 from test_docs import WALK
 
@@ -155,7 +155,7 @@ def test_who_is_elsewhere_is_there_at_once(walk: Clip) -> None:
 def test_motion_that_begins_to_tremble_is_kept_back_gently() -> None:
     buffer, at = JitterBuffer(0.1), list[float]()
     for k in range(90):
-        late = Tremble(20.0, None, LATE_S) if k >= 45 else Tremble()
+        late = StreamTremble(20.0, None, LATE_S) if k >= 45 else StreamTremble()
         buffer.add(k * STEP, 100 + k * STEP, np.array([k * STEP, 0, 0.0]), np.eye(4)[:1], None, late)
         pose = buffer.read(100 + k * STEP)
         assert pose is not None
@@ -178,7 +178,7 @@ def test_keypoints_are_smoothed_before_a_body_is_fitted(tracker: Tracker, walk: 
         if k % 7 == 0:
             # One is not seen, also while the person stands.
             points[rng.integers(len(names))] = np.nan
-        fit.fit(Frame("a", names, points, now, now))
+        fit.fit(KeypointFrame("a", names, points, now, now))
         for arrived, packet in [p for line in fit.inbox.take().values() for p in line]:
             assert arrived == now and packet.tremble is not None
             if k > 150:

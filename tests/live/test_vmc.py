@@ -14,7 +14,7 @@ from poise.jobs.open import open_run
 from poise.live import quats as q
 from poise.live.commands import LiveConfig
 from poise.live.passage import world_of
-from poise.live.people import OntoBody
+from poise.live.people import Calibration
 from poise.live.session import Live
 from poise.live.stream import Inbox
 from poise.live.vmc import (
@@ -147,7 +147,7 @@ def test_through_the_body_and_out_again() -> None:
     tracker, clip = open_run(None).tracker, on_vrm()
     assert tracker.recovery_clips is not None
     ease = tracker.recovery_clips.ease.numpy()
-    onto = OntoBody.by(clip, tracker.humanoid, tracker.example, ease, tracker.onto)
+    onto = Calibration.by(clip, tracker.humanoid, tracker.example, ease, tracker.onto)
     onto.feet, onto.floor, onto.planted = {}, 0.0, 0.0
     factor = onto.scale
     puppet = Puppet(tracker.humanoid.table, tracker.example, clip.skeleton, 1.0 / factor)

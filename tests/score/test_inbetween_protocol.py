@@ -16,7 +16,7 @@ from inbetween import truth_rows
 from inbetween_baselines import Baseline
 
 from poise.formats import read_clip
-from poise.learn.transition import Layout
+from poise.learn.transition import SkeletonLayout
 from poise.motion.windows import LAFAN1_FACING, pack_frames, without_still_root
 from poise.score.gaps import BANDAI, LAFAN1, Protocol, deviation, evaluate, slide, test_set
 from poise.score.gaps import TestSet as InbetweenTestSet
@@ -184,7 +184,7 @@ def compare(bank, twin, protocol):
     test = make_test_set(bank, std, protocol)
     windows = twin.windows(65, 40)
     assert len(test.root) == len(windows)
-    layout = Layout(bank.parents, bank.feet, bank.facing)
+    layout = SkeletonLayout(bank.parents, bank.feet, bank.facing)
     for kind in ("zero-velocity", "interpolation"):
         for row in evaluate(Baseline(kind, layout), test, LENGTHS):
             theirs = twin.figures(windows, their_std, row.length, kind)

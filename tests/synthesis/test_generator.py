@@ -23,7 +23,7 @@ from poise.learn.cvae import (
     CVAEConfig,
     CVAEObjective,
     CVAETraining,
-    Frames,
+    PackedFrames,
     cosines,
     falling,
     settling,
@@ -75,7 +75,7 @@ def test_frames_and_coordinates_are_the_same_motion(motions: Motions) -> None:
 
 
 def test_windows_lie_within_clips() -> None:
-    frames = Frames(torch.arange(30.0)[:, None], torch.tensor([0, 20, 30]))
+    frames = PackedFrames(torch.arange(30.0)[:, None], torch.tensor([0, 20, 30]))
     assert frames.count(12) == 9
     drawn = frames.draw(200, 12, torch.Generator().manual_seed(0))[..., 0]
     assert bool((torch.diff(drawn, dim=1) == 1).all()) and set(drawn[:, 0].tolist()) == set(range(9))
@@ -84,7 +84,9 @@ def test_windows_lie_within_clips() -> None:
 
 
 def test_windows_are_drawn_by_weights_and_end_with_their_clip() -> None:
-    frames = Frames(torch.arange(30.0)[:, None], torch.tensor([0, 20, 30]), torch.tensor([1.0, 9.0]))
+    frames = PackedFrames(
+        torch.arange(30.0)[:, None], torch.tensor([0, 20, 30]), torch.tensor([1.0, 9.0])
+    )
     starts = frames.starts(2000, 10, torch.Generator().manual_seed(0))
     # Eleven windows of weight 1, one of weight 9.
     assert abs(float((starts == 20).float().mean()) - 9 / 20) < 0.05
@@ -97,7 +99,7 @@ def test_windows_are_drawn_by_weights_and_end_with_their_clip() -> None:
 def test_labels_are_drawn_more_evenly(motions: Motions) -> None:
     windows = torch.tensor([90, 20, 10]).repeat_interleave(1)
     first = torch.cat((torch.zeros(1, dtype=torch.long), (windows + 29).cumsum(0)))
-    many = replace(motions, frames=Frames(torch.zeros(int(first[-1]), 3), first))
+    many = replace(motions, frames=PackedFrames(torch.zeros(int(first[-1]), 3), first))
     kinds = torch.tensor([0, 1, 1])
     for balance, share in ((0.5, 3**0.5 / (1 + 3**0.5)), (1.0, 0.5)):
         even = balanced(many, kinds, Endless(replace(SMALL, past=10, future=20), balance=balance))
@@ -112,7 +114,7 @@ def test_short_clips_teach_from_their_own_past_too() -> None:
     net = CosineCVAE(ROOT + 1, replace(COSINE, past=6), generator=torch.Generator().manual_seed(0))
     frames = torch.randn(60, ROOT + 1, generator=torch.Generator().manual_seed(1))
     # The first clip has room for a segment that follows half of one, not for one that follows a whole.
-    sampler = Frames(frames, torch.tensor([0, 25, 60]), torch.tensor([1.0, 0.001]))
+    sampler = PackedFrames(frames, torch.tensor([0, 25, 60]), torch.tensor([1.0, 0.001]))
     learner = CVAEObjective(net, CVAETraining(batch=8, own_past=1.0, shorter=True), 100)
     rng = torch.Generator().manual_seed(2)
     parts = [learner.step(sampler, k, rng) for k in range(12)]

@@ -87,7 +87,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.open import open_run
     from poise.kinematics.travel import find_travel, travelled
     from poise.live.commands import LiveConfig
-    from poise.live.session import Session, Wanted
+    from poise.live.session import Session, SessionConfig
     from poise.live.sockets import LOOPBACK
 
     with working("opening the policy"):
@@ -100,7 +100,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         count = o.characters or max(1, len(clips))
         config = LiveConfig(count, o.buffer, o.lookahead, o.noise, o.seed)
         token = None if o.host in LOOPBACK else secrets.token_urlsafe(24)
-        wanted = Wanted(
+        wanted = SessionConfig(
             clips,
             o.keypoints,
             o.vmc,

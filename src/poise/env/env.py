@@ -16,7 +16,7 @@ from poise.env.controls import Controls
 from poise.env.evaluate import Sources, Terms, seen_by
 from poise.env.frame import FIELDS, Frame, Pose, placed
 from poise.env.goal import Goal
-from poise.env.plugins import Ended, Plugin, combined, ends_of
+from poise.env.plugins import EpisodesEnded, Plugin, combined, ends_of
 from poise.env.reference import Reference
 from poise.env.style import ClipFeatures, ClipWindows
 from poise.env.task import EnvStep, StepLog, TaskConfig, displaced_goal, goal_of, plugins_of
@@ -393,7 +393,7 @@ class ImitationEnv:
         if self.task.auto_reset:
             ids = (step.terminated | step.truncated).nonzero().squeeze(-1)
             counted = combined((p.counted() for p in self.plugins), torch.logical_and)
-            ended = Ended(ids, step.failed, step.terminated, self.age, goal, self._row, counted)
+            ended = EpisodesEnded(ids, step.failed, step.terminated, self.age, goal, self._row, counted)
             for plugin in self.plugins:
                 plugin.count(ended)
             if len(ids):

@@ -147,7 +147,7 @@ def seen_by(terms: tuple[ObsTerm, ...], frame: Frame) -> Tensor:
     return torch.cat(parts, -1) if parts else frame.phase.unsqueeze(-1)[:, :0]
 
 
-class Evaluation(NamedTuple):
+class TermValues(NamedTuple):
     """obs `(N, O)`. scores `(2 + K, N)`: the reward, the part of it that is imitation, and the value of
     each of K reward terms. ends `(3, N)` bool: failed, terminated, truncated. style `(N, F)`: what a
     motion prior sees."""
@@ -204,11 +204,11 @@ class Terms:
         """The observations `(N, O)`."""
         return self._run("observe", self._observe, sources)[0]
 
-    def judge(self, sources: Mapping[str, Tensor]) -> Evaluation:
+    def judge(self, sources: Mapping[str, Tensor]) -> TermValues:
         """Observations, rewards and failures."""
         worlds = len(sources["age"])
         if not self.fused or worlds < MANY:
-            return Evaluation(*(x.clone() for x in self._run("judge", self.evaluated, sources)))
+            return TermValues(*(x.clone() for x in self._run("judge", self.evaluated, sources)))
         # A recording runs without Python's lock, so that the second half really runs beside the first.
         # Many worlds are always cut, whatever the machine, since it may move the last digit.
         halves = zip(*(x.tensor_split(2) for x in sources.values()), strict=True)
@@ -218,7 +218,7 @@ class Terms:
         other = self._helper().submit(self._run, "judge", self.evaluated, second)
         ours, theirs = self._run("judge", self.evaluated, first), other.result()
         obs, scores, ends, style = zip(ours, theirs, strict=True)
-        return Evaluation(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1), torch.cat(style))
+        return TermValues(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1), torch.cat(style))
 
     def _helper(self) -> ThreadPoolExecutor:
         if self._pool is None:
@@ -230,7 +230,7 @@ class Terms:
         return (seen_by(self.obs, self.frame(sources)),)
 
     def evaluated(self, sources: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
-        """All terms one by one, in the order of `Evaluation`."""
+        """All terms one by one, in the order of `TermValues`."""
         frame = self.frame(sources)
         rewards = [term.fn(frame, **term.params) for term in self.rewards]
         values = torch.stack(rewards or [frame.phase])[: len(rewards)]

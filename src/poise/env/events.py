@@ -53,7 +53,7 @@ class Happening:
         """Goes on from `state()`."""
 
 
-class Drawn(Happening):
+class RandomEvent(Happening):
     """An event with a generator of its own."""
 
     def __init__(self, seed: int):

@@ -43,7 +43,7 @@ class Pose:
 FIELDS = tuple(f.name for f in fields(Pose))
 
 
-class Place(NamedTuple):
+class PosePlace(NamedTuple):
     """What a packed pose says of its clip, float32 `(N)` each.
 
     Attributes:
@@ -59,12 +59,12 @@ class Place(NamedTuple):
     body: Tensor
 
 
-class Layout:
+class PoseLayout:
     """Where the numbers of a pose and of its place stand in a row of packed poses `(N, W)`."""
 
     def __init__(self, pose: Pose):
         self._shapes = tuple(getattr(pose, name).shape[1:] for name in FIELDS)
-        self._widths = [*(math.prod(shape) for shape in self._shapes), len(Place._fields)]
+        self._widths = [*(math.prod(shape) for shape in self._shapes), len(PosePlace._fields)]
 
     @property
     def width(self) -> int:
@@ -84,9 +84,9 @@ class Layout:
         ]
         return Pose(*shaped)
 
-    def place(self, packed: Tensor) -> Place:
+    def place(self, packed: Tensor) -> PosePlace:
         """What the rows of `packed (N, W)` say of their clips, as views of it."""
-        return Place(*packed[:, -len(Place._fields) :].unbind(-1))
+        return PosePlace(*packed[:, -len(PosePlace._fields) :].unbind(-1))
 
 
 def packed_pose(pose: Pose) -> Tensor:
@@ -288,7 +288,7 @@ class Context:
     left: `(3,)` the root's axis by which headings are taken, see `TaskConfig.left`; None: its twist.
     """
 
-    layout: Layout
+    layout: PoseLayout
     local: Callable[[Tensor], Tensor]
     roots: Tensor
     hinges: int
@@ -348,7 +348,7 @@ def window(frame: Frame) -> Pose:
     return headed(frame.context.layout.unpacked(frame.source("window")), frame.context.left)
 
 
-def place(frame: Frame) -> Place:
+def place(frame: Frame) -> PosePlace:
     """Where in its clip the goal is."""
     return frame.context.layout.place(frame.source("goal"))
 

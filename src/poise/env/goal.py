@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.bins import Outcomes
-from poise.env.frame import Layout
+from poise.env.frame import PoseLayout
 from poise.env.reference import Reference, Start
 from poise.env.starts import Starts
 from poise.errors import PoiseError
@@ -30,7 +30,7 @@ class Goal(ABC):
         humanoid: the goal is in its coordinates; the first of `bodies`.
         bodies: all bodies, of the same joints and hinges.
         rate_hz: control steps a second.
-        layout: where the numbers of packed poses `(N, W)` stand, see `Layout`.
+        layout: where the numbers of packed poses `(N, W)` stand, see `PoseLayout`.
         num_envs: N.
         device: where its tensors are.
         rng: of all draws that starts make, on the CPU.
@@ -40,7 +40,7 @@ class Goal(ABC):
     humanoid: Humanoid
     bodies: tuple[Humanoid, ...]
     rate_hz: float
-    layout: Layout
+    layout: PoseLayout
     num_envs: int
     device: torch.device
     rng: torch.Generator

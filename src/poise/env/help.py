@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.control import HelpSchedule
 from poise.env.goal import Group
-from poise.env.plugins import Ended, Plugin
+from poise.env.plugins import EpisodesEnded, Plugin
 from poise.errors import PoiseError
 
 #: How much older episodes count, at each decision, against the ones since the last.
@@ -110,7 +110,7 @@ class HelpBudget(Plugin):
         ended, failed = self._counts.sum(1).tolist()
         return 1.0 - failed / ended if ended else float("nan")
 
-    def count(self, ended: Ended) -> None:
+    def count(self, ended: EpisodesEnded) -> None:
         if self.schedule is None:
             return
         if self.by == "bin":

@@ -42,7 +42,7 @@ class Felt(NamedTuple):
 
 
 @dataclass(eq=False)
-class Ended:
+class EpisodesEnded:
     """What became of the episodes in one control step.
 
     Attributes:
@@ -150,7 +150,7 @@ class Plugin:
         """`(N,)` bool, worlds with outcomes that count for help and adaptive sampling; None: all."""
         return None
 
-    def count(self, ended: Ended) -> None:
+    def count(self, ended: EpisodesEnded) -> None:
         """Notes the outcomes of one control step, where episodes begin anew."""
 
     def past(self, rows: Tensor) -> Tensor | None:
@@ -223,7 +223,7 @@ class AdaptiveSampling(Plugin):
         self.steps = 0
         self._rate()
 
-    def count(self, ended: Ended) -> None:
+    def count(self, ended: EpisodesEnded) -> None:
         self.add(ended.bins)
 
     def add(self, seen: Outcomes) -> None:

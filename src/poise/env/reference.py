@@ -15,7 +15,7 @@ from torch import Tensor
 from poise.body import Humanoid, make_spec
 from poise.env.bins import MotionBins
 from poise.env.evaluate import Recorded
-from poise.env.frame import FIELDS, Layout, Pose
+from poise.env.frame import FIELDS, Pose, PoseLayout
 from poise.errors import PoiseError
 from poise.kinematics import Kinematics, cycle_step, cycle_velocity, qpos_velocity
 from poise.motion.rotations import heading_quat, quat_mul, quat_rotate
@@ -119,11 +119,11 @@ class Poser:
         """`(F, J, 4)` wxyz local turns of hinged bodies."""
         return self._fast.local_quats(qpos)
 
-    def layout(self) -> Layout:
+    def layout(self) -> PoseLayout:
         """Where the numbers of this humanoid's poses stand in packed rows."""
         qpos = torch.zeros(1, self.humanoid.model.nq, dtype=torch.float64)
         qpos[:, 3] = 1.0
-        return Layout(self(qpos, torch.zeros(1, self.humanoid.model.nv, dtype=torch.float64)))
+        return PoseLayout(self(qpos, torch.zeros(1, self.humanoid.model.nv, dtype=torch.float64)))
 
 
 def _centre_of_mass(humanoid: Humanoid, pos: Tensor, quat: Tensor) -> Tensor:
@@ -210,7 +210,7 @@ class Reference:
         self._after = self.rows(clip, frame + 1)
         pose = self._poses(qpos, qvel, self.body[clip])
         #: Where the numbers of packed poses stand.
-        self.layout = Layout(pose)
+        self.layout = PoseLayout(pose)
         self._packed = self.layout.pack(pose, self._place)
         #: The same of what policies are told, where that is something else, see `told`.
         self._told: Tensor | None = None

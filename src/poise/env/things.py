@@ -11,7 +11,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from poise.env.events import Condition, Drawn, Happening
+from poise.env.events import Condition, Happening, RandomEvent
 from poise.errors import PoiseError, did_you_mean
 from poise.settings import Checked, Positive, Range
 from poise.sim import SceneSim
@@ -43,7 +43,7 @@ class SetDown:
         return _SetDown(self, sim)
 
 
-class _SetDown(Drawn):
+class _SetDown(RandomEvent):
     def __init__(self, event: SetDown, sim: SceneSim):
         super().__init__(event.seed)
         place = sim.scene.place(event.name)
@@ -99,7 +99,7 @@ class Throw(Checked):
         return _Throw(self, sim, control_hz)
 
 
-class _Throw(Drawn):
+class _Throw(RandomEvent):
     def __init__(self, event: Throw, sim: SceneSim, control_hz: float):
         super().__init__(event.seed)
         if sim.scene.place(event.name).coordinates != 7:

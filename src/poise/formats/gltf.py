@@ -11,7 +11,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.formats.gltf_bodies import choose_joints, humanoid_of
 from poise.formats.gltf_file import GltfFile, load_gltf
-from poise.formats.gltf_tracks import Take, Track, Tree, choose_take, read_tree
+from poise.formats.gltf_tracks import AnimationTrack, Take, Tree, choose_take, read_tree
 from poise.formats.nodes import base_of, checked_unit, even, rigid_bones, unique_names
 from poise.formats.raw import RawMotion, ReadOptions, assemble
 from poise.formats.text import MAX_VALUE
@@ -168,7 +168,7 @@ def _ends(file: GltfFile, joints: list[int]) -> tuple[tuple[int, tuple[float, fl
 
 
 def _clock(
-    take: Take, tracks: Sequence[Track], fps: float | None, file: GltfFile, notes: list[str]
+    take: Take, tracks: Sequence[AnimationTrack], fps: float | None, file: GltfFile, notes: list[str]
 ) -> tuple[np.ndarray, float]:
     """The times `(T,)` s at which all channels are read, and frames per second.
 

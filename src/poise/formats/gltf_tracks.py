@@ -165,7 +165,7 @@ _KIND = re.compile(r"(?i)(rotation|translation|location|position|scale|quaternio
 
 
 @dataclass(frozen=True)
-class Track:
+class AnimationTrack:
     """One channel: key times `(K,)` s, and values `(K, n)`, or `(3K, n)` for CUBICSPLINE (in-tangent,
     value, out-tangent). Quaternions are wxyz."""
 
@@ -221,7 +221,7 @@ class Take:
     """The chosen animation: `(node, path) -> Track`, its name, and Poise's own `extras`."""
 
     name: str
-    tracks: dict[tuple[int, str], Track]
+    tracks: dict[tuple[int, str], AnimationTrack]
     extras: dict[str, Any]
 
     def nodes(self, *paths: str, varying: bool = False) -> set[int]:
@@ -362,7 +362,7 @@ def _span(
 
 
 def _take(file: GltfFile, tree: Tree, members: list[int], name: str) -> Take:
-    tracks: dict[tuple[int, str], Track] = {}
+    tracks: dict[tuple[int, str], AnimationTrack] = {}
     known: dict[int, np.ndarray] = {}
     channels = (c for index in members for c in _channels(file, tree, index))
     for what, node, path, sampler in channels:
@@ -382,7 +382,7 @@ def _take(file: GltfFile, tree: Tree, members: list[int], name: str) -> Take:
                 file.path,
                 code="channel-repeated",
             )
-        tracks[node, path] = Track(times, values, mode)
+        tracks[node, path] = AnimationTrack(times, values, mode)
     extras = file.doc["animations"][members[0]].get("extras")
     own = extras.get("poise") if isinstance(extras, dict) else None
     return Take(name, tracks, own if isinstance(own, dict) else {})

@@ -212,7 +212,7 @@ _HANDS = ("hand", "wrist")
 
 
 @dataclass(frozen=True)
-class Support:
+class BorneBy:
     """How a body is borne if one axis is the vertical; shares of its size.
 
     wander: how much the height of what bears it varies. off: how far its weight lies beside it, averaged
@@ -241,7 +241,7 @@ class Support:
         return self.wander + self.off + 0.4 * self.apart + 10.0 * self.creep + lost
 
 
-def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> dict[str, Support]:
+def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> dict[str, BorneBy]:
     """The support of a body by each of `UPS`, from poses `(S, J, 3)` and those `LATER_S` later."""
     size = max(float(np.median(np.linalg.norm(np.ptp(positions, axis=1), axis=-1))), 1e-12)
     weight = _weight(names, positions)
@@ -270,7 +270,7 @@ def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> 
             and np.median(height[:, heads[0]] - low) < 2 * _REACH * size
         )
         if not borne.any():
-            out[up] = Support(float(np.ptp(low)) / size, 1.0, 0.0, apart, creep, slide, head)
+            out[up] = BorneBy(float(np.ptp(low)) / size, 1.0, 0.0, apart, creep, slide, head)
             continue
         wander = float(np.subtract(*np.percentile(low[borne], [95, 5]))) / size
         flat = [k for k in range(3) if k != c]
@@ -280,7 +280,7 @@ def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> 
         over = np.where(mask, places, -np.inf).max(1) + _REACH * size
         beside = np.maximum(at - over, 0.0) - np.maximum(under - at, 0.0)
         off = float(np.linalg.norm(beside.mean(0))) / size
-        out[up] = Support(wander, off, float(borne.mean()), apart, creep, slide, head)
+        out[up] = BorneBy(wander, off, float(borne.mean()), apart, creep, slide, head)
     return out
 
 
@@ -377,7 +377,7 @@ def guess_up(
 
 
 def _why(
-    best: str, second: str, moving: str | None, resting: str | None, borne: Support, margin: float
+    best: str, second: str, moving: str | None, resting: str | None, borne: BorneBy, margin: float
 ) -> str:
     """The sentence about a vertical that is not plain to see."""
     agree = moving == resting == best

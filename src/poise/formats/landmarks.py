@@ -10,7 +10,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.formats.markers import NEEDED, SIDES, find_places, known_labels, marker_places, unknown_labels
 from poise.formats.point_noise import (
-    Tremble,
+    RemovedTremble,
     drop_spikes,
     fill,
     longest_stretch,
@@ -40,7 +40,7 @@ class Landmarks:
     tracks: dict[str, np.ndarray]
     first: int
     notes: tuple[str, ...]
-    tremble: Tremble | None = None
+    tremble: RemovedTremble | None = None
 
 
 def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -145,7 +145,7 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
     tracks = _filled(tracks, points.fps)
-    found: Tremble | None = None
+    found: RemovedTremble | None = None
     if smooth_hz is None and not points.source.raw:
         tracks, found = still(tracks, points.fps)
     if found is not None:

@@ -269,7 +269,7 @@ def _local(
 
 
 @dataclass(frozen=True)
-class Kind:
+class ArrayKind:
     """Named arrays that are a motion: what they are called, how they are known, what reads them."""
 
     name: str
@@ -277,16 +277,16 @@ class Kind:
     read: Callable[[Mapping[str, Any], Path, ReadOptions], Clip]
 
 
-KINDS: tuple[Kind, ...] = (
-    Kind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
-    Kind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
-    Kind("Kimodo (posed_joints)", is_kimodo, read_kimodo),
-    Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
-    Kind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
-    Kind("MDM (motion, lengths)", is_mdm, as_clip(mdm_points)),
-    Kind("joints, fps", is_named_joints, as_clip(named_joint_points)),
-    Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
-    Kind("a robot's joint angles", is_qpos, refuse_qpos),
+KINDS: tuple[ArrayKind, ...] = (
+    ArrayKind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
+    ArrayKind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
+    ArrayKind("Kimodo (posed_joints)", is_kimodo, read_kimodo),
+    ArrayKind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
+    ArrayKind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
+    ArrayKind("MDM (motion, lengths)", is_mdm, as_clip(mdm_points)),
+    ArrayKind("joints, fps", is_named_joints, as_clip(named_joint_points)),
+    ArrayKind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
+    ArrayKind("a robot's joint angles", is_qpos, refuse_qpos),
 )
 """Named arrays that are known, whether they come from `.npz`, `.npy` or `.pkl`; first match reads."""
 

@@ -165,7 +165,7 @@ CLEAR = 6.0
 
 
 @dataclass(frozen=True)
-class Tremble:
+class RemovedTremble:
     """A tremble that was taken off: mm (rms over places), and Hz, None from frame to frame."""
 
     size_mm: float
@@ -177,7 +177,9 @@ class Tremble:
         return "from frame to frame" if self.hz is None else f"at {self.hz:.1f} Hz"
 
 
-def still(tracks: Mapping[str, np.ndarray], fps: float) -> tuple[dict[str, np.ndarray], Tremble | None]:
+def still(
+    tracks: Mapping[str, np.ndarray], fps: float
+) -> tuple[dict[str, np.ndarray], RemovedTremble | None]:
     """The tracks `(T, 3)` m of the places of a body without their noise, and what it was; None where
     there is none, and the tracks as they are. What is long is told and smoothed by pieces."""
     names = list(tracks)
@@ -199,13 +201,13 @@ def still(tracks: Mapping[str, np.ndarray], fps: float) -> tuple[dict[str, np.nd
 
 def _piece(
     places: np.ndarray, fps: float, bones: list[tuple[int, int]]
-) -> tuple[np.ndarray, Tremble] | None:
+) -> tuple[np.ndarray, RemovedTremble] | None:
     """A piece `(T, K, 3)` without its noise and that, None where it has none."""
     frames, count = places.shape[:2]
     if frames < SHORTEST:
         return None
     groups, calm = np.repeat(np.arange(count), 3), places.reshape(frames, -1)
-    found: Tremble | None = None
+    found: RemovedTremble | None = None
     for _ in range(LINES):
         spectrum = Spectrum.of(calm, fps, groups)
         # Of a tremble that is gone the bones keep what their turning made of it, at other frequencies.
@@ -215,14 +217,16 @@ def _piece(
         if told is None:
             break
         hz, size = told
-        found = max(found or Tremble(0.0, hz), Tremble(1e3 * math.sqrt(size), hz), key=_size)
+        found = max(
+            found or RemovedTremble(0.0, hz), RemovedTremble(1e3 * math.sqrt(size), hz), key=_size
+        )
         calm = calm - tremble_of(calm, groups, spectrum, hz, size)[0]
     white = white_mm(places, fps) if found is None else 0.0
     if found is None and white < WHITE_MM:
         return None
     floor = Spectrum.of(calm, fps, groups).floor()
     calm = smoothed(calm, fps, groups, floor)
-    return calm.reshape(places.shape), found or Tremble(white, None)
+    return calm.reshape(places.shape), found or RemovedTremble(white, None)
 
 
 def _tone(
@@ -264,5 +268,5 @@ def _clearest(lengths: Spectrum, top: float) -> float | None:
     return hz if clear and hz < top else None
 
 
-def _size(tremble: Tremble) -> float:
+def _size(tremble: RemovedTremble) -> float:
     return tremble.size_mm

@@ -221,7 +221,7 @@ def _check(raw: RawPoints) -> None:
 
 
 @dataclass(frozen=True)
-class _Body:
+class _SampledBody:
     """Places of a body in sampled frames `(S, P, 3)`: what tells its size, and all that it may stand on.
 
     later: `every`, `LATER_S` later.
@@ -235,7 +235,7 @@ class _Body:
     later: np.ndarray
 
 
-def _body(points: Keypoints) -> _Body:
+def _body(points: Keypoints) -> _SampledBody:
     tracks, _ = places_of(points)
     seen = np.asarray(~np.isnan(np.stack([tracks[p][:, 0] for p in NEEDED], -1)).any(-1))
     frames = np.flatnonzero(seen)
@@ -258,7 +258,7 @@ def _body(points: Keypoints) -> _Body:
     names = [n for n in _TREE if n in places]
     parents = [-1 if (up := _TREE[n]) is None else names.index(up) for n in names]
     known = [n for n in places if not np.isnan(tracks[n][after[at]]).any()]
-    return _Body(
+    return _SampledBody(
         names,
         parents,
         np.stack([places[n] for n in names], 1),
@@ -277,7 +277,7 @@ def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
     return out
 
 
-def _unit(body: _Body, options: ReadOptions, raw: RawPoints) -> Guess:
+def _unit(body: _SampledBody, options: ReadOptions, raw: RawPoints) -> Guess:
     height, how = body_height(body.names, body.parents, _offsets(body.parents, body.pos), body.pos)
     if not height > 0:
         raise PoiseError("all keypoints lie in one place", raw.path, code="points-in-one-place")
@@ -289,7 +289,7 @@ def _unit(body: _Body, options: ReadOptions, raw: RawPoints) -> Guess:
     return guess_unit(height, how, None, raw.path)
 
 
-def _up(body: _Body, options: ReadOptions, raw: RawPoints) -> Guess:
+def _up(body: _SampledBody, options: ReadOptions, raw: RawPoints) -> Guess:
     if options.up_axis is not None:
         return Guess(options.up_axis.upper())
     if raw.up_axis is None:

@@ -24,7 +24,7 @@ _FRAMES = {"frame", "frame#", "frames", "index", "frame_index", "fnum", "#", ""}
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _Columns:
     """Which column is what: label -> columns of x, y, z; label -> column of its confidence."""
 
     header: list[str]
@@ -96,7 +96,7 @@ def _split(line: str, mark: str) -> list[str]:
     return [cell.strip().strip('"') for cell in line.rstrip("\r\n").split(mark)]
 
 
-def _layout(header: list[str], path: Path, line: int) -> _Layout:
+def _layout(header: list[str], path: Path, line: int) -> _Columns:
     where = at_line(path, line)
     axes: dict[str, dict[str, int]] = {}
     scores: dict[str, int] = {}
@@ -134,10 +134,10 @@ def _layout(header: list[str], path: Path, line: int) -> _Layout:
             "Name the columns NAME_x, NAME_y, NAME_z",
             code="no-keypoints",
         )
-    return _Layout(header, whole, scores, time)
+    return _Columns(header, whole, scores, time)
 
 
-def _rows(lines: list[str], first: int, layout: _Layout, path: Path, mark: str) -> np.ndarray:
+def _rows(lines: list[str], first: int, layout: _Columns, path: Path, mark: str) -> np.ndarray:
     width = len(layout.header)
     out: list[list[float]] = []
     used = {k for columns in layout.points.values() for k in columns} | set(layout.scores.values())
@@ -161,7 +161,7 @@ def _rows(lines: list[str], first: int, layout: _Layout, path: Path, mark: str) 
 
 
 def _rate(
-    table: np.ndarray, layout: _Layout, stated: dict[str, str], options: ReadOptions, path: Path
+    table: np.ndarray, layout: _Columns, stated: dict[str, str], options: ReadOptions, path: Path
 ) -> float:
     """Frames per second: stated by the caller, by the comment, or measured on the times."""
     if options.fps is not None:

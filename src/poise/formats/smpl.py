@@ -94,7 +94,7 @@ PELVIS = (0.0, -0.22, 0.03)
 
 
 @dataclass(frozen=True)
-class Layout:
+class SmplLayout:
     """One member of the SMPL family: which joints its `poses` turn, in their order.
 
     offsets `(J, 3)` m: the default body, Y up, facing +Z. tips: as `Skeleton.ends`.
@@ -144,7 +144,7 @@ def _hand(side: str, sign: float) -> list[_Row]:
     return out
 
 
-def _layout(name: str, rows: list[_Row]) -> Layout:
+def _layout(name: str, rows: list[_Row]) -> SmplLayout:
     names = tuple(r[0] for r in rows)
     parents = tuple(-1 if r[1] is None else names.index(r[1]) for r in rows)
     tips = []
@@ -156,10 +156,10 @@ def _layout(name: str, rows: list[_Row]) -> Layout:
                 tips.append((names.index(joint), _mirrored(tip, sign)))
     offsets = np.array([r[2] for r in rows])
     offsets.flags.writeable = False
-    return Layout(name, names, parents, offsets, tuple(sorted(tips)))
+    return SmplLayout(name, names, parents, offsets, tuple(sorted(tips)))
 
 
-def _layouts() -> tuple[Layout, ...]:
+def _layouts() -> tuple[SmplLayout, ...]:
     body = _expand(_BODY)
     hands = [row for side, sign in _SIDES for row in _hand(side, sign)]
     return (
@@ -174,12 +174,12 @@ LAYOUTS = _layouts()
 """22 joints (66 numbers a frame), 24 (72), 52 with fingers (156), 55 with face as well (165)."""
 
 
-def layout_of_width(width: int) -> Layout | None:
+def layout_of_width(width: int) -> SmplLayout | None:
     """The layout with `poses` of `width` numbers a frame."""
     return next((layout for layout in LAYOUTS if layout.width == width), None)
 
 
-def layout_of_joints(skeleton: Skeleton) -> Layout | None:
+def layout_of_joints(skeleton: Skeleton) -> SmplLayout | None:
     """The layout with exactly the joints of a skeleton, None if there is none."""
     joints = skeleton.names, skeleton.parents
     return next((x for x in LAYOUTS if (x.names, x.parents) == joints), None)
@@ -303,7 +303,7 @@ def _needed(data: Mapping[str, Any], names: Sequence[str], path: Path) -> str:
     return str(found)
 
 
-def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, Layout]:
+def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, SmplLayout]:
     """`(T, J, 3)` axis-angle vectors in rad, and the layout with that many joints."""
     key = _first(data, _POSES)
     if key is not None:
@@ -374,7 +374,7 @@ def _scale(data: Mapping[str, Any], path: Path, options: ReadOptions) -> tuple[f
 
 
 def _rest(
-    data: Mapping[str, Any], path: Path, layout: Layout, notes: list[str]
+    data: Mapping[str, Any], path: Path, layout: SmplLayout, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The pelvis in the model's frame `(3,)` and the offsets `(J, 3)`, m, Y up."""
     count = len(layout.names)
@@ -400,7 +400,7 @@ def _rest(
 def _up(
     data: Mapping[str, Any],
     options: ReadOptions,
-    layout: Layout,
+    layout: SmplLayout,
     root_pos: np.ndarray,
     quat: torch.Tensor,
     fps: float,
@@ -475,7 +475,7 @@ def _told(data: Mapping[str, Any]) -> list[str]:
 
 
 def _extra(
-    data: Mapping[str, Any], layout: Layout, pelvis: np.ndarray, up: str
+    data: Mapping[str, Any], layout: SmplLayout, pelvis: np.ndarray, up: str
 ) -> tuple[tuple[str, str], ...]:
     """What writing back needs besides the clip itself."""
     betas = np.asarray(data["betas"]) if "betas" in data else np.zeros(16)

@@ -15,10 +15,10 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.formats import home_suffix, write_clip
-from poise.jobs.deliver import Delivery, Stage, key_errors, stage_of
+from poise.jobs.deliver import Delivery, StageMotion, key_errors, stage_of
 from poise.jobs.inbetween.fill import Inbetweened, inbetween
 from poise.jobs.open import open_run
-from poise.jobs.result import Result, Shown, clip_of
+from poise.jobs.result import Result, ResultView, clip_of
 from poise.jobs.track import TrackConfig, Tracked, track, write
 from poise.jobs.track.controllers import Merit
 from poise.jobs.track.direction import Weight
@@ -69,7 +69,7 @@ class Completed(Result):
     tracked: Tracked
     at: tuple[int, ...]
     met_mm: tuple[float, ...]
-    stages: tuple[Stage, ...]
+    stages: tuple[StageMotion, ...]
     retiming: Retiming | None
 
     @property
@@ -103,10 +103,10 @@ class Completed(Result):
             return f"{told}."
         return f"{told}, which is missed: more keyframes, --retime or --controller search may help."
 
-    def _shown(self) -> Shown:
+    def _shown(self) -> ResultView:
         travel, filled = self.tracked.travel, self.filled.clip
         filled = filled if travel is None else travel.written(filled)
-        return Shown(self.clip, filled, self.card, self.notes, self.at)
+        return ResultView(self.clip, filled, self.card, self.notes, self.at)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         return self.write(folder).paths

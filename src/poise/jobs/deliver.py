@@ -430,7 +430,7 @@ def _lasting(rollouts: RolloutSet, recording: Recording, name: str, frames: int)
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageMotion:
     """What one stage made.
 
     Attributes:
@@ -473,10 +473,10 @@ def key_errors(made: Clip, source: Clip, keys: Sequence[int], at: Sequence[int])
     )
 
 
-def stage_of(name: str, made: Clip, key_mm: Sequence[float]) -> Stage:
+def stage_of(name: str, made: Clip, key_mm: Sequence[float]) -> StageMotion:
     """The figures of a motion. key_mm: see `key_errors`."""
     figures, pos = examine(made).figures, made.positions()
     names = ("sole_slide_mm_per_s", "penetration_mm", "float_mm", "jerk_m_per_s3")
     speed = np.linalg.norm(np.diff(pos, axis=0), axis=-1).max() * made.fps
     slide, sinks, floats, jerk = (figures.get(n) for n in names)
-    return Stage(name, float(np.mean(key_mm)), slide, sinks, floats, jerk, float(speed))
+    return StageMotion(name, float(np.mean(key_mm)), slide, sinks, floats, jerk, float(speed))

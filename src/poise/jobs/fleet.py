@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from poise.errors import PoiseError
-from poise.jobs.workers import Ended, Workers
+from poise.jobs.workers import WorkerExit, Workers
 from poise.learn.checkpoint import write_atomic
 from poise.version import __version__
 
@@ -165,7 +165,7 @@ class _Fleet:
         self.write()
         self.tell("started", record)
 
-    def end(self, ended: Ended) -> None:
+    def end(self, ended: WorkerExit) -> None:
         record, job = self.records[ended.name], self.jobs[ended.name]
         record.seconds += time.monotonic() - self.begun.pop(ended.name)
         record.pid, record.error = None, ended.said

@@ -23,7 +23,7 @@ from poise.jobs.deliver import Delivery, deliver, finished
 from poise.jobs.keep import claimed
 from poise.jobs.open import Run, open_run
 from poise.jobs.practice import EVALUATING, Watching, practise
-from poise.jobs.result import Result, Shown, clip_of
+from poise.jobs.result import Result, ResultView, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
 from poise.jobs.track import Tracked, write
@@ -97,11 +97,11 @@ class Imitated(Result):
             own += [] if travel is None or travel.sentence() in own else [travel.sentence()]
         return (*own, *self.task.report.sentences(), *self._finished.notes)
 
-    def _shown(self) -> Shown:
+    def _shown(self) -> ResultView:
         source = self.tracked.placed.source if self.tracked else self.task.library.clips[0]
         if self.tracked is not None and self.tracked.travel is not None:
             source = self.tracked.travel.beside
-        return Shown(self.clip, source, self.card, self.notes)
+        return ResultView(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         paths = self.deliver(folder).paths

@@ -29,7 +29,7 @@ from poise.jobs.track.controllers import LOST, TRACKED
 from poise.jobs.track.learning import (
     GRAVITY,
     SHARES,
-    Learned,
+    LearnedMotion,
     from_every_start,
     help_of,
     help_wanted,
@@ -93,7 +93,7 @@ class Practised(NamedTuple):
     """
 
     tracked: Tracked | None
-    learned: Learned
+    learned: LearnedMotion
     first: Tracked | None
     sentences: tuple[str, ...] = ()
 
@@ -188,7 +188,7 @@ def _newtons(newtons: float, tracker: Tracker) -> str:
 def _best(
     clip: Clip,
     tracker: Tracker,
-    learned: Learned,
+    learned: LearnedMotion,
     first: Tracked | None,
     newtons: float,
     config: TrackConfig,

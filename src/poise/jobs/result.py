@@ -15,7 +15,7 @@ from poise.score import table as rows_of
 from poise.score.report.svg import result_html
 
 
-class Shown(NamedTuple):
+class ResultView(NamedTuple):
     """What a result shows of itself.
 
     clip: the motion on the skeleton that came in. source: what came in. card: the score of the
@@ -33,7 +33,7 @@ class Result(ABC):
     """A motion that a verb made. Each has `clip`, `card`, `notes`, and what its own class says."""
 
     @abstractmethod
-    def _shown(self) -> Shown: ...
+    def _shown(self) -> ResultView: ...
 
     @abstractmethod
     def _save_all(self, folder: Path) -> dict[str, Path]: ...

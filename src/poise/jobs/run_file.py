@@ -51,7 +51,7 @@ class _Earlier(TypedDict):
     seconds: float
 
 
-class _Body(TypedDict):
+class _BodyMeta(TypedDict):
     table: dict[str, Any]
     names: list[str]
 
@@ -75,7 +75,7 @@ class RunMeta(_Run, total=False):
     character: str
     earlier: _Earlier
     table: dict[str, Any]
-    body: _Body
+    body: _BodyMeta
 
 
 class InbetweenMeta(TypedDict):

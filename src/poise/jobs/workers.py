@@ -28,7 +28,7 @@ _POLL_S = 0.1
 _NOT_FOR_JOBS = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID")
 
 
-class Ended(NamedTuple):
+class WorkerExit(NamedTuple):
     """How a job's process ended."""
 
     name: str
@@ -123,14 +123,14 @@ class LocalWorkers:
         self._running[name] = (process, log)
         return process.pid
 
-    def ended(self) -> list[Ended]:
+    def ended(self) -> list[WorkerExit]:
         """The jobs that ended since the last call; waits a moment if there are none."""
         over = [(n, p, log) for n, (p, log) in self._running.items() if p.poll() is not None]
         for name, _, _ in over:
             del self._running[name]
         if not over:
             time.sleep(_POLL_S)
-        return [Ended(n, p.returncode, error_in(log, p.returncode)) for n, p, log in over]
+        return [WorkerExit(n, p.returncode, error_in(log, p.returncode)) for n, p, log in over]
 
     def stop(self) -> None:
         """Asks the running jobs to save and end, and waits until they have."""
@@ -180,15 +180,15 @@ class RayWorkers:
         self._running[self._run.remote(list(command), str(log))] = name
         return None
 
-    def ended(self) -> list[Ended]:
+    def ended(self) -> list[WorkerExit]:
         ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=5 * _POLL_S)
         out = []
         for ref in ready:
             name = self._running.pop(ref)
             try:
-                out.append(Ended(name, *self._ray.get(ref)))
+                out.append(WorkerExit(name, *self._ray.get(ref)))
             except self._ray.exceptions.RayError as problem:
-                out.append(Ended(name, 1, f"its Ray worker was lost ({type(problem).__name__})"))
+                out.append(WorkerExit(name, 1, f"its Ray worker was lost ({type(problem).__name__})"))
         return out
 
     def stop(self) -> None:

@@ -20,7 +20,7 @@ from poise.kinematics.repair.support import anatomy_of, sole_slide, support_of
 from poise.kinematics.repair.turns import swap_sides
 from poise.kinematics.retarget.own_body import onto_own, own_body
 from poise.kinematics.retarget.retarget_report import RetargetReport
-from poise.kinematics.retarget.transfer import Rested, RetargetConfig, retarget, with_rest_pose
+from poise.kinematics.retarget.transfer import RestPoseResult, RetargetConfig, retarget, with_rest_pose
 
 __all__ = [
     "CORRECTIONS",
@@ -30,7 +30,7 @@ __all__ = [
     "IkBody",
     "IkConfig",
     "Kinematics",
-    "Rested",
+    "RestPoseResult",
     "RetargetConfig",
     "RetargetReport",
     "analytic_ik",

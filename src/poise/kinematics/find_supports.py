@@ -25,7 +25,7 @@ FRICTION, OF_A_WALL = 0.8, 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class RequiredWrench:
     """What a motion asks of the world.
 
     Attributes:
@@ -59,7 +59,7 @@ class Asked:
         return float(left), forces
 
 
-def asked(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> Asked:
+def asked(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> RequiredWrench:
     """What a motion asks of the world; `pos`, `quat`: `(T, B, 3)` m and `(T, B, 4)`, places of its
     rows."""
     mass = np.array([r.mass for r in table.rows])
@@ -70,7 +70,7 @@ def asked(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> Asked:
     spin = (np.cross(parts - com[:, None], rate - speed[:, None]) * mass[:, None]).sum(1)
     acc = np.gradient(speed, axis=0) * fps
     force = mass.sum() * (acc + np.array([0.0, 0.0, GRAVITY]))
-    return Asked(com, force, np.gradient(spin, axis=0) * fps, float(mass.sum() * GRAVITY))
+    return RequiredWrench(com, force, np.gradient(spin, axis=0) * fps, float(mass.sum() * GRAVITY))
 
 
 def _edges(normals: np.ndarray) -> np.ndarray:
@@ -146,7 +146,9 @@ def _joined(spells: Sequence[NotAlone], frames: int) -> list[tuple[int, int]]:
     return out
 
 
-def _borne(spell: tuple[int, int], solid: Solid, wanted: Asked) -> list[tuple[Candidate, float]]:
+def _borne(
+    spell: tuple[int, int], solid: Solid, wanted: RequiredWrench
+) -> list[tuple[Candidate, float]]:
     """What bears a spell, with the greatest force on each; nothing where it stays unborne."""
     first, last = spell
     frames = np.unique(np.linspace(first, last, min(FRAMES, last - first + 1)).round().astype(int))
@@ -186,7 +188,7 @@ def _contacts(
 
 
 def _missing(
-    frames: np.ndarray, chosen: Sequence[Candidate], solid: Solid, wanted: Asked,
+    frames: np.ndarray, chosen: Sequence[Candidate], solid: Solid, wanted: RequiredWrench,
     before: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """What is missing in each frame; that of `before` where the last of `chosen` changes nothing."""
@@ -202,7 +204,7 @@ def _missing(
 
 
 def _force(
-    frames: np.ndarray, chosen: Sequence[Candidate], which: int, solid: Solid, wanted: Asked
+    frames: np.ndarray, chosen: Sequence[Candidate], which: int, solid: Solid, wanted: RequiredWrench
 ) -> float:
     """The greatest force on one of them, N."""
     most = 0.0

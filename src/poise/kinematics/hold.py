@@ -15,7 +15,7 @@ from poise.kinematics.feet import Sole, bearing, dragged, soles_of
 from poise.kinematics.forward import lowest_height
 from poise.kinematics.limbs import limb_of, match_positions
 from poise.kinematics.repair.faults import Fault
-from poise.kinematics.repair.support import Support, foot_slips
+from poise.kinematics.repair.support import FloorPoints, foot_slips
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import (
     axis_angle_to_quat,
@@ -171,7 +171,7 @@ def _add(
 
 #: How often it is done: a leg that is led back moves its foot a little.
 HOLD_ROUNDS = 2
-#: How much a foot bears that stands for certain, see `Standing`.
+#: How much a foot bears that stands for certain, see `StandingFoot`.
 FIRM = 100.0
 #: rad/s of a leg's joint above which a foot is rather not held.
 FASTEST = 25.0
@@ -179,7 +179,7 @@ FASTEST = 25.0
 LIFT_S = 0.05
 
 
-class Standing(NamedTuple):
+class StandingFoot(NamedTuple):
     """How a foot stands.
 
     sole: its points.
@@ -200,7 +200,7 @@ def hold(
     root: Tensor,
     rot: Tensor,
     fps: float,
-    standing: Callable[[Tensor, Tensor], Mapping[int, Standing]],
+    standing: Callable[[Tensor, Tensor], Mapping[int, StandingFoot]],
     fixed: Tensor | None = None,
     vertical: float = 0.0,
     rounds: int = HOLD_ROUNDS,
@@ -227,7 +227,7 @@ def hold(
 
 
 @dataclass(frozen=True)
-class Held:
+class HoldReport:
     """What holding moved: mm that an ankle was led away from its path, on average over frames in which a
     foot bears and at most; and the feet that were left as they were."""
 
@@ -236,7 +236,7 @@ class Held:
     left: tuple[str, ...] = ()
 
 
-def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
+def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, HoldReport]:
     """The clip with its standing feet held, and what that took; all but the legs stays as it is.
 
     A foot bears where an end of its sole is near the floor and neither rises nor swings (`bearing`).
@@ -247,10 +247,10 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
         table: the body with the soles; feet without a box have no sole. The floor is at z = 0.
     """
     if clip.frames < 3:
-        return clip, Held(0.0, 0.0)
+        return clip, HoldReport(0.0, 0.0)
     rows, bears, left = [r.joint for r in table.rows], dict[int, np.ndarray](), set[int]()
 
-    def standing(pos: Tensor, quat: Tensor) -> dict[int, Standing]:
+    def standing(pos: Tensor, quat: Tensor) -> dict[int, StandingFoot]:
         pos, quat = pos[:, rows], quat[:, rows]
         soles, low, out = soles_of(table, pos, quat), lowest_height(table, pos, quat), {}
         weights = bearing([sole.ends for sole in soles.values()], clip.fps)
@@ -260,7 +260,7 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
             weight = weight * ~dragged(sole, weight, clip.fps)[:, None]
             deep = (-low[:, row]).clamp_min(0.0).numpy()
             lift = torch.tensor(smooth_lift(deep, clip.fps, LIFT_S)) if deep.any() else None
-            out[rows[row]] = Standing(sole, weight, lift)
+            out[rows[row]] = StandingFoot(sole, weight, lift)
             steps = (weight.amax(-1) > 0).numpy()
             bears[rows[row]] = np.append(steps, steps[-1])
         return out
@@ -276,7 +276,7 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
     borne = np.concatenate([moved[when, foot] for foot, when in bears.items()] or [np.zeros(0)])
     most = max((float(moved[:, foot].max()) for foot in bears), default=0.0)
     names = tuple(clip.skeleton.names[foot] for foot in sorted(left))
-    return held, Held(float(borne.mean()) if len(borne) else 0.0, most, names)
+    return held, HoldReport(float(borne.mean()) if len(borne) else 0.0, most, names)
 
 
 def _too_fast(
@@ -304,7 +304,7 @@ SWING_SPEED = 1.0
 FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
 
 
-def drifts(support: Support) -> bool:
+def drifts(support: FloorPoints) -> bool:
     """Whether the path itself drifts: what slips is one motion of the floor, the same for both feet.
 
     A foot tells where its whole sole is down for `FLAT_S` and slips steadily; one that rolls, pivots or
@@ -346,7 +346,7 @@ def _mean_near(slip: np.ndarray, weight: np.ndarray, fps: float) -> tuple[np.nda
     return np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None], total
 
 
-def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
+def mend_path(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
     """The clip with its root path freed of the slip that all standing feet have in common.
 
     The mean slip of the planted sole points, averaged over time, is taken off the root's horizontal
@@ -377,10 +377,10 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     return clip.replaced(root_pos=path)
 
 
-def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
+def mend_slides(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
     """The clip with every sliding foot held in place while it stands, its leg bent to follow (`hold`).
 
-    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`, but where
+    In a spell of `faults` the points of the sole that are in contact bear, see `StandingFoot`, but where
     they swing through.
     """
     speed, contact = support.contacts
@@ -394,9 +394,9 @@ def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
         if bool(slides.any()):
             weights[foot] = mine, (contact[:, mine] & slides).double() * FIRM
 
-    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
+    def standing(pos: Tensor, _: Tensor) -> dict[int, StandingFoot]:
         return {
-            foot: Standing(Sole(pos[:, foot], support.soles[:, mine]), weight)
+            foot: StandingFoot(Sole(pos[:, foot], support.soles[:, mine]), weight)
             for foot, (mine, weight) in weights.items()
         }
 
@@ -420,7 +420,7 @@ ROLLS_S = 0.3
 BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 
 
-def steadied(clip: Clip, support: Support) -> Clip:
+def steadied(clip: Clip, support: FloorPoints) -> Clip:
     """The clip with its feet held while they stand; see the module's text."""
     stands, level, rise = stance(support)
     firm, upright = (float(_firm(s / q)) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
@@ -429,12 +429,12 @@ def steadied(clip: Clip, support: Support) -> Clip:
     if firm <= 0.0 or not bool(weight.any()):
         return clip
 
-    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
-        out = dict[int, Standing]()
+    def standing(pos: Tensor, _: Tensor) -> dict[int, StandingFoot]:
+        out = dict[int, StandingFoot]()
         for foot in dict.fromkeys(support.feet):
             mine = [k for k, joint in enumerate(support.feet) if joint == foot]
             sole, own = Sole(pos[:, foot], support.soles[:, mine]), weight[:, mine]
-            out[foot] = Standing(sole, own, flat=own.amin(-1))
+            out[foot] = StandingFoot(sole, own, flat=own.amin(-1))
         return out
 
     root, rot = clip.tensors()
@@ -442,7 +442,7 @@ def steadied(clip: Clip, support: Support) -> Clip:
     return clip.replaced(rot=out.numpy())
 
 
-def stance(support: Support) -> tuple[np.ndarray, float, float]:
+def stance(support: FloorPoints) -> tuple[np.ndarray, float, float]:
     """How likely each end of a sole stands between frames `(T - 1, F)`, and the deviations of its level
     speed (by axis) and of its rise while it does, m/s. Contacts that a file states stay."""
     soles, fps = support.soles.numpy(), support.fps

@@ -16,7 +16,7 @@ from poise.body import Humanoid, make_spec
 from poise.errors import PoiseError, did_you_mean
 from poise.kinematics.ik_body import IkBody, arc, rotate
 from poise.kinematics.ik_frames import (
-    Frames,
+    BodyFrames,
     IkConfig,
     continuous_euler,
     pointing_angles,
@@ -103,7 +103,7 @@ def _rotations(
     points: Tensor, body: IkBody, config: IkConfig, turns: Tensor | None
 ) -> dict[int, Tensor]:
     """World rotations `(T, 3, 3)` of the rows that positions tell something about."""
-    frames, rest = Frames(points, body, config), rest_frames(body, config)
+    frames, rest = BodyFrames(points, body, config), rest_frames(body, config)
     if not config.square:
         return _paper_rotations(frames, rest, body)
     out: dict[int, Tensor] = {}
@@ -119,7 +119,7 @@ def _rotations(
     return out
 
 
-def _paper_rotations(frames: Frames, rest: Frames, body: IkBody) -> dict[int, Tensor]:
+def _paper_rotations(frames: BodyFrames, rest: BodyFrames, body: IkBody) -> dict[int, Tensor]:
     """The same through Eq. 6 from parent to child, whatever it makes of frames that are not square."""
     rows = body.table.rows
     out = {0: frames.frames[0] @ rest.frames[0][0].T @ body.rest_rot[0]}
@@ -212,7 +212,7 @@ DAMPING = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
-class Polished:
+class PolishResult:
     """qpos: `(T, 7 + hinges)`. before_mm, after_mm: mean distance of the targets. seconds: wall time.
     moved_deg: the largest change of a hinge angle."""
 
@@ -228,7 +228,7 @@ def polish(
     targets: Mapping[str, np.ndarray],
     humanoid: Humanoid,
     steps: int = 12,
-) -> Polished:
+) -> PolishResult:
     """The motion with joints on their targets, as near to `qpos (T, 7 + hinges)` as they allow.
 
     Per frame, quadratic programs min |J dq - e|^2 + |W dq|^2 by mink (FrameTask and PostureTask), from
@@ -290,7 +290,7 @@ def polish(
         qpos[t] = best_q
     moved = np.degrees(np.abs(qpos[:, 7:] - given[:, 7:]).max(initial=0.0))
     was, now = (float(np.mean(x)) if x else 0.0 for x in (before, after))
-    return Polished(qpos, was, now, time.perf_counter() - start, float(moved))
+    return PolishResult(qpos, was, now, time.perf_counter() - start, float(moved))
 
 
 def _errors(state: Any, here: Mapping[str, np.ndarray], body: IkBody) -> np.ndarray:

@@ -60,7 +60,7 @@ class IkConfig(Checked):
         return all(self.on(c) for c in CORRECTIONS if c != "branches")
 
 
-class Frames:
+class BodyFrames:
     """World frames `(T, 3, 3)` of rows from the positions `p (T, P, 3)` of one motion.
 
     frames: row -> its frame, columns x, y, z; square except where an error of the paper is kept.
@@ -213,7 +213,7 @@ class Frames:
             config.hold_frames,
         )
 
-    def rest(self) -> Frames:
+    def rest(self) -> BodyFrames:
         """The frames of the rest pose under the same equations."""
         return self if self.at_rest else rest_frames(self.body, self.config)
 
@@ -237,9 +237,9 @@ class Frames:
 
 
 @lru_cache(maxsize=32)
-def rest_frames(body: IkBody, config: IkConfig) -> Frames:
-    """`Frames` of the humanoid's own rest pose, in which all angles are zero."""
-    return Frames(body.rest_pos[None], body, config, at_rest=True)
+def rest_frames(body: IkBody, config: IkConfig) -> BodyFrames:
+    """`BodyFrames` of the humanoid's own rest pose, in which all angles are zero."""
+    return BodyFrames(body.rest_pos[None], body, config, at_rest=True)
 
 
 #: lambda of Eq. 7 (rad).

@@ -14,7 +14,15 @@ from torch.nn import functional
 
 from poise.errors import PoiseError
 from poise.learn.networks import bfloat16_is_fast
-from poise.learn.transition import Filled, Known, Layout, continued, into_place, out_of_place, place_of
+from poise.learn.transition import (
+    FilledGap,
+    Known,
+    SkeletonLayout,
+    continued,
+    into_place,
+    out_of_place,
+    place_of,
+)
 from poise.learn.windows import Sampler, Windows
 from poise.motion.rotations import (
     matrix_kinematics,
@@ -61,7 +69,7 @@ class BetweenConfig:
             )
 
 
-class Gap(NamedTuple):
+class GapFrames(NamedTuple):
     """All frames `(N, T, ...)`, in the place of the last frame before the first gap; known frames are
     the given ones.
 
@@ -168,7 +176,7 @@ class Between(nn.Module):
     step_std: Tensor
 
     def __init__(
-        self, layout: Layout, config: BetweenConfig | None = None, *, generator: torch.Generator
+        self, layout: SkeletonLayout, config: BetweenConfig | None = None, *, generator: torch.Generator
     ):
         super().__init__()
         self.layout, self.config = layout, config or BetweenConfig()
@@ -238,7 +246,7 @@ class Between(nn.Module):
     def forward(
         self, root: Tensor, rot: Tensor, known: Tensor, offsets: Tensor, code: Tensor | None = None,
         drop: Dropout | None = None,
-    ) -> tuple[Gap, Gap | None]:  # fmt: skip
+    ) -> tuple[GapFrames, GapFrames | None]:  # fmt: skip
         """All frames and, with a refiner, the refined ones.
 
         Args:
@@ -261,7 +269,7 @@ class Between(nn.Module):
         first = self._correct(self.encoder, x, root, sixd, mats, known, near, extra, drop)
         if self.refiner is None:
             return first, None
-        held = Gap(*(v.detach() for v in first))
+        held = GapFrames(*(v.detach() for v in first))
         sixd = held.mats[..., :2].transpose(-1, -2).flatten(-2)
         x = self._seen(self._joined(held.root, sixd, held.mats, offsets))
         x = torch.cat((x, held.contact), -1)
@@ -272,7 +280,7 @@ class Between(nn.Module):
     def _correct(
         self, encoder: _Encoder, x: Tensor, root: Tensor, sixd: Tensor, mats: Tensor,
         known: Tensor, near: Neighbours, extra: Tensor | None, drop: Dropout | None,
-    ) -> Gap:  # fmt: skip
+    ) -> GapFrames:  # fmt: skip
         out = encoder(x, known, near, extra, drop).float()
         joints = self.layout.joints
         free = (~known).to(out)[:, None]
@@ -280,12 +288,12 @@ class Between(nn.Module):
         delta = out[..., 3 : 3 + 6 * joints].unflatten(-1, (joints, 6))
         turned = sixd_to_matrix(sixd + delta)
         mats = torch.where(known[:, None, None, None], mats, turned)
-        return Gap(root, mats, out[..., 3 + 6 * joints :])
+        return GapFrames(root, mats, out[..., 3 + 6 * joints :])
 
     def complete(
         self, root: Tensor, rot: Tensor, known: Tensor, offsets: Tensor,
         noise: torch.Generator | None = None,
-    ) -> Filled:  # fmt: skip
+    ) -> FilledGap:  # fmt: skip
         """All frames `(N, T, ...)`, in the world, with the unknown ones filled; see `forward`."""
         at = last_before_gap(known)
         place = place_of(root[:, at], rot[:, at], self.layout.facing)
@@ -297,9 +305,9 @@ class Between(nn.Module):
         pos = matrix_kinematics(self.layout.parents, offsets.unsqueeze(1), own, quat_to_matrix(turned))[
             0
         ]
-        return Filled(own, turned, gap.contact.sigmoid(), pos)
+        return FilledGap(own, turned, gap.contact.sigmoid(), pos)
 
-    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> Filled:
+    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> FilledGap:
         """See `learn.transition.TransitionNet`."""
         past = known.past_root.shape[1]
         n, joints = len(known.target_root), self.layout.joints
@@ -310,7 +318,7 @@ class Between(nn.Module):
         seen = torch.ones(past + length + 1, dtype=torch.bool)
         seen[past : past + length] = False
         filled = self.complete(root, rot, seen, known.offsets, noise)
-        return Filled(*(v[:, past : past + length] for v in filled))
+        return FilledGap(*(v[:, past : past + length] for v in filled))
 
 
 def last_before_gap(known: Tensor) -> int:
@@ -513,7 +521,7 @@ class BetweenObjective:
         return total, {k: v.detach() for k, v in parts.items()}
 
     def _parts(
-        self, gap: Gap, truth: tuple[Tensor, Tensor], batch: Windows, known: Tensor
+        self, gap: GapFrames, truth: tuple[Tensor, Tensor], batch: Windows, known: Tensor
     ) -> dict[str, Tensor]:
         layout, hidden = self.net.layout, ~known
         pos, mats = matrix_kinematics(layout.parents, batch.offsets.unsqueeze(1), gap.root, gap.mats)

@@ -199,8 +199,12 @@ class CosineCVAE(nn.Module):
         self.register_buffer("told", ramp * cosines(c.future, made) * c.future**0.5, persistent=False)
         self.register_buffer("going", _FADE * (1 - torch.exp(-t / _FADE)), persistent=False)
         wide = (known + 2) * features
-        self.encoder = Residual(wide + made * features, c.hidden, c.blocks, 2 * c.latent, 0.1, generator)
-        self.decoder = Residual(wide + c.latent, c.hidden, c.blocks, made * features, 0.1, generator)
+        self.encoder = ResidualLayer(
+            wide + made * features, c.hidden, c.blocks, 2 * c.latent, 0.1, generator
+        )
+        self.decoder = ResidualLayer(
+            wide + c.latent, c.hidden, c.blocks, made * features, 0.1, generator
+        )
 
     @torch.no_grad()
     def calibrate(self, frames: Tensor) -> None:
@@ -247,7 +251,7 @@ class CosineCVAE(nn.Module):
         return self.decode(self.scaled(past), z) * self.std + self.mean
 
 
-class Residual(nn.Module):
+class ResidualLayer(nn.Module):
     """A perceptron with layers that add to what came before them: x + W_2 silu(W_1 norm(x))."""
 
     def __init__(
@@ -346,7 +350,7 @@ class CVAETraining(Checked):
                    segments=1, noise=0.0, mix=0.0, grad_norm=1e9, products="float32")  # fmt: skip
 
 
-class Frames:
+class PackedFrames:
     """Windows of packed frames.
 
     Args:
@@ -424,7 +428,7 @@ class CVAEObjective:
         """What is trained, by name."""
         return {"net": self.net}
 
-    def step(self, sampler: Frames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def step(self, sampler: PackedFrames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         """One update; the parts of the loss."""
         c, p, f = self.config, self.net.config.past, self.net.config.future
         segments, stride = 1, f

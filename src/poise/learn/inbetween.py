@@ -37,7 +37,7 @@ from poise.learn.checkpoint import (
 from poise.learn.rollout import TrainingError
 from poise.learn.rtn import RTN, RTNConfig
 from poise.learn.run import Log, interruptible
-from poise.learn.transition import Filled, Known, Layout, TransitionNet, joint_positions
+from poise.learn.transition import FilledGap, Known, SkeletonLayout, TransitionNet, joint_positions
 from poise.settings import Checked, Count, NotNegative, Positive, Range, check_data, from_data
 
 #: Times that saving takes, which pass until the next checkpoint at least.
@@ -298,12 +298,14 @@ class InbetweenModel:
     example: tuple[State, list[Any]] | None = None
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> SkeletonLayout:
         """The skeleton as the network sees it."""
         return self.net.layout
 
 
-def make_net(kind: str, layout: Layout, config: BetweenConfig | RTNConfig, seed: int) -> Between | RTN:
+def make_net(
+    kind: str, layout: SkeletonLayout, config: BetweenConfig | RTNConfig, seed: int
+) -> Between | RTN:
     """A fresh network with weights from the seed.
 
     Raises:
@@ -358,7 +360,7 @@ def load_model(path: Path) -> InbetweenModel:
         )
     try:
         said = meta["layout"]
-        layout = Layout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
+        layout = SkeletonLayout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
         kind = BetweenConfig if meta["net"] == "transformer" else RTNConfig
         said = dict(meta["config"])
         if kind is BetweenConfig:
@@ -438,7 +440,7 @@ def smoothness_loss(root: Tensor) -> Tensor:
     return (torch.where(step > 0, step, torch.ones_like(step)).sqrt() * (step > 0)).sum(1)
 
 
-def test_loss(net: TransitionNet, known: Known, filled: Filled, config: Adaptation) -> Tensor:
+def test_loss(net: TransitionNet, known: Known, filled: FilledGap, config: Adaptation) -> Tensor:
     """Eq. 4 `(N)` of transitions that a network gave."""
     feet = list(net.layout.feet)
     seen = joint_positions(net.layout, known.offsets, known.past_root[:, -1:], known.past_rot[:, -1:])

@@ -201,7 +201,7 @@ def gae(
     return advantage, advantage + value
 
 
-class Drawn(NamedTuple):
+class Draws(NamedTuple):
     """What the old policy drew.
 
     Attributes:
@@ -216,11 +216,11 @@ class Drawn(NamedTuple):
     mean: Tensor
     log_std: Tensor
 
-    def take(self, index: Tensor) -> Drawn:
+    def take(self, index: Tensor) -> Draws:
         """Some of the samples."""
         action, log_prob, mean = (x.index_select(0, index) for x in self[:3])
         own = self.log_std.dim() > 1
-        return Drawn(
+        return Draws(
             action, log_prob, mean, self.log_std.index_select(0, index) if own else self.log_std
         )
 
@@ -233,7 +233,7 @@ def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor,
 
 
 def policy_loss(
-    config: PPOConfig, mean: Tensor, log_std: Tensor, advantage: Tensor, old: Drawn
+    config: PPOConfig, mean: Tensor, log_std: Tensor, advantage: Tensor, old: Draws
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The loss to descend, and for the log: itself, the KL and the share of clipped ratios.
 
@@ -292,7 +292,7 @@ class _Batch(NamedTuple):
     obs: Tensor
     advantage: Tensor
     target: Tensor
-    old: Drawn
+    old: Draws
     context: Tensor | None
     near: Tensor | None
 
@@ -425,7 +425,7 @@ class PPO:
         config, kl = self.config, 0.0
         advantage = rollout.advantage.flatten()
         obs, policy = rollout.obs[:-1].flatten(0, 1), self.actor.policy
-        old = Drawn(
+        old = Draws(
             rollout.action.flatten(0, 1),
             rollout.log_prob.flatten(),
             rollout.mean.flatten(0, 1),

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-class Step(NamedTuple):
+class StepResult(NamedTuple):
     """What one control step of N environments gives back; N rows each, on the env's device.
 
     The tensors need to stay valid only until the next call of `step`.
@@ -50,7 +50,7 @@ class VecEnv(Protocol):
         """Starts a new episode in every row and returns its observation `(N, O)` float32."""
         ...
 
-    def step(self, actions: Tensor) -> Step:
+    def step(self, actions: Tensor) -> StepResult:
         """Applies actions `(N, A)` float32, unbounded, for one control step."""
         ...
 

@@ -13,9 +13,9 @@ from torch.nn import functional
 from poise.learn.between import linear, schedule
 from poise.learn.networks import bfloat16_is_fast
 from poise.learn.transition import (
-    Filled,
+    FilledGap,
     Known,
-    Layout,
+    SkeletonLayout,
     continued,
     into_place,
     joint_positions,
@@ -71,7 +71,7 @@ def noise_scale(tta: Tensor) -> Tensor:
     return ((tta - 5) / 25).clamp(0.0, 1.0)
 
 
-class Steps(NamedTuple):
+class RtnOutput(NamedTuple):
     """What the network said, in the place of the last frame seen.
 
     Attributes:
@@ -97,7 +97,9 @@ class RTN(nn.Module):
     offset_std: Tensor
     usual_rot: Tensor
 
-    def __init__(self, layout: Layout, config: RTNConfig | None = None, *, generator: torch.Generator):
+    def __init__(
+        self, layout: SkeletonLayout, config: RTNConfig | None = None, *, generator: torch.Generator
+    ):
         super().__init__()
         self.layout, self.config = layout, config or RTNConfig()
         c, quats, feet = self.config, 4 * layout.joints, len(layout.feet)
@@ -130,7 +132,7 @@ class RTN(nn.Module):
         self.velocity_std.copy_(torch.diff(root, dim=1).flatten(0, 1).std(0).clamp_min(1e-3))
         self.offset_std.copy_((root - root[:, :1]).flatten(0, 1).std(0).clamp_min(1e-2))
 
-    def forward(self, known: Known, length: int, noise: Tensor | None = None) -> Steps:
+    def forward(self, known: Known, length: int, noise: Tensor | None = None) -> RtnOutput:
         """The transition in the place of the last frame seen, in which `known` stands already.
 
         noise: `(N, 512)` standard normal, drawn once per sequence; None leaves the target as it is.
@@ -169,7 +171,7 @@ class RTN(nn.Module):
             root, feet = root + speed, said[:, quats + 3 :].sigmoid()
             out.append((root, rot, feet))
         roots, rots, contacts = (torch.stack(x, 1) for x in zip(*out, strict=True))
-        return Steps(roots, rots.unflatten(-1, (-1, 4)), contacts)
+        return RtnOutput(roots, rots.unflatten(-1, (-1, 4)), contacts)
 
     def _past_contacts(self, known: Known) -> Tensor:
         """Contacts of the past from its own steps: no later frame may be looked at."""
@@ -197,14 +199,16 @@ class RTN(nn.Module):
         """Target noise `(count, 512)` of standard normals."""
         return torch.randn(count, 2 * self.config.encoder[1], generator=noise).to(self.velocity_std)
 
-    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> Filled:
+    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> FilledGap:
         """See `learn.transition.TransitionNet`; `noise` draws the target noise for variety."""
         place = place_of(known.past_root[:, -1], known.past_rot[:, -1], self.layout.facing)
         draw = None if noise is None else self.draw(len(known.target_root), noise)
         steps = self(self.seen(known), length, draw)
         root, rot = out_of_place(steps.root, steps.rot, place)
         rot = continued(rot, known.past_rot[:, -1])
-        return Filled(root, rot, steps.contact, joint_positions(self.layout, known.offsets, root, rot))
+        return FilledGap(
+            root, rot, steps.contact, joint_positions(self.layout, known.offsets, root, rot)
+        )
 
 
 class Critic(nn.Module):
@@ -342,7 +346,7 @@ class RTNObjective:
         return {**parts, "critics": judged, "loss": loss.detach(), "longest": torch.tensor(float(most))}
 
     def loss(
-        self, steps: Steps, pos: Tensor, batch: Windows, truth: Tensor, fake: Tensor
+        self, steps: RtnOutput, pos: Tensor, batch: Windows, truth: Tensor, fake: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """L1 of local quaternions, root, positions and contacts, the critics' verdict, Eq. 3's slide;
         the parts that are returned are as they are, before they are made equal."""

@@ -20,7 +20,7 @@ from poise.motion.rotations import (
 
 
 @dataclass(frozen=True)
-class Layout:
+class SkeletonLayout:
     """What a network must know of a skeleton.
 
     Attributes:
@@ -57,7 +57,7 @@ class Known(NamedTuple):
     offsets: Tensor
 
 
-class Filled(NamedTuple):
+class FilledGap(NamedTuple):
     """A transition.
 
     Attributes:
@@ -76,9 +76,9 @@ class Filled(NamedTuple):
 class TransitionNet(Protocol):
     """The one interface of both networks; it is blind to where on the ground and in which heading."""
 
-    layout: Layout
+    layout: SkeletonLayout
 
-    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> Filled:
+    def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> FilledGap:
         """`length` frames between the last known one and the target; gradients flow to the weights.
 
         noise: draws a variant where the network can; without it the result is the same every time.
@@ -90,7 +90,7 @@ class TransitionNet(Protocol):
         ...
 
 
-class Place(NamedTuple):
+class WindowPlace(NamedTuple):
     """Where a window stood.
 
     Attributes:
@@ -102,19 +102,19 @@ class Place(NamedTuple):
     heading: Tensor
 
 
-def place_of(root: Tensor, rot: Tensor, facing: Sequence[float]) -> Place:
+def place_of(root: Tensor, rot: Tensor, facing: Sequence[float]) -> WindowPlace:
     """The place of one frame: root `(N, 3)`, rot `(N, J, 4)`."""
     axis = torch.tensor(tuple(facing), dtype=root.dtype, device=root.device)
     xy = root * torch.tensor([1.0, 1.0, 0.0], dtype=root.dtype, device=root.device)
-    return Place(xy.unsqueeze(1), axis_heading(rot[:, 0], axis).unsqueeze(1))
+    return WindowPlace(xy.unsqueeze(1), axis_heading(rot[:, 0], axis).unsqueeze(1))
 
 
-def into_place(root: Tensor, rot: Tensor, place: Place) -> tuple[Tensor, Tensor]:
+def into_place(root: Tensor, rot: Tensor, place: WindowPlace) -> tuple[Tensor, Tensor]:
     """Frames `(N, T, ...)` as seen from a place: its ground point the origin, its heading +X."""
     return _turned(root - place.xy, rot, quat_conj(place.heading))
 
 
-def out_of_place(root: Tensor, rot: Tensor, place: Place) -> tuple[Tensor, Tensor]:
+def out_of_place(root: Tensor, rot: Tensor, place: WindowPlace) -> tuple[Tensor, Tensor]:
     """The inverse of `into_place`."""
     root, rot = _turned(root, rot, place.heading)
     return root + place.xy, rot
@@ -126,7 +126,7 @@ def _turned(root: Tensor, rot: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
     return quat_rotate(turn, root), torch.cat((first, rot[..., 1:, :]), -2)
 
 
-def joint_positions(layout: Layout, offsets: Tensor, root: Tensor, rot: Tensor) -> Tensor:
+def joint_positions(layout: SkeletonLayout, offsets: Tensor, root: Tensor, rot: Tensor) -> Tensor:
     """Global positions `(N, T, J, 3)` of local quaternions `(N, T, J, 4)`; offsets `(N, J, 3)`."""
     mats = quat_to_matrix(rot)
     return matrix_kinematics(layout.parents, offsets.unsqueeze(1), root, mats)[0]

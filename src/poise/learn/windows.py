@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import State, take
-from poise.learn.transition import Layout
+from poise.learn.transition import SkeletonLayout
 from poise.motion.rotations import normalize
 
 
@@ -45,7 +45,7 @@ class FrameData:
         std: `(J, 3)` m, the deviations that L2P divides by.
     """
 
-    layout: Layout
+    layout: SkeletonLayout
     root: Tensor
     rot: Tensor
     contact: Tensor

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.live.characters import FALLS, RETURNS, Endless, tensor
+from poise.live.characters import FALLS, RETURNS, EndlessCoords, tensor
 from poise.live.commands import LiveConfig
-from poise.live.people import OntoBody, People, calibrated
+from poise.live.people import Calibration, People, calibrated
 from poise.live.stream import Packet, margin
 from poise.live.vmc import Own
-from poise.live.world import World
+from poise.live.world import LiveWorld
 from poise.motion import Clip
 from poise.synthesis.generator import Kinematic
 
@@ -41,7 +41,7 @@ class Next(NamedTuple):
     places: Tensor | None
 
 
-class Aims:
+class Targets:
     """The people that come, and what characters make of them.
 
     Args:
@@ -55,14 +55,18 @@ class Aims:
     """
 
     def __init__(
-        self, world: World, config: LiveConfig, executor: Executor | None, generator: Kinematic | None
+        self,
+        world: LiveWorld,
+        config: LiveConfig,
+        executor: Executor | None,
+        generator: Kinematic | None,
     ):
         self.world, self.noise, self.generator = world, config.noise, generator
         self._executor = executor
         self.people = People(config.characters, config.buffer_s, self._calibration, executor)
         for k, character in enumerate(world.characters):
             character.on_move(lambda seen, to, k=k: self._moved(k, seen, to))
-        self.endless = dict[int, Endless]()
+        self.endless = dict[int, EndlessCoords]()
         self.read_s: float | None = None
         self._errors = dict[int, np.ndarray]()
         # What was read of each character's person in the last steps; None where the goal is another.
@@ -149,7 +153,7 @@ class Aims:
                 places = places + 0.03 * size * wander[n:].reshape(places.shape)
         return qpos, places
 
-    def _calibration(self, packet: Packet, clip: Clip) -> OntoBody | str:
+    def _calibration(self, packet: Packet, clip: Clip) -> Calibration | str:
         t = self.world.tracker
         ease = t.recovery_clips.ease.numpy() if t.recovery_clips is not None else np.zeros(0)
         return calibrated(packet, clip, t.humanoid, t.example, ease, t.onto)
@@ -173,4 +177,4 @@ class Aims:
             self.endless.pop(k, None)
         elif self.generator is not None and k not in self.endless:
             seed = int(self.rng.integers(2**31))
-            self.endless[k] = Endless(self.generator, seed, self._executor)
+            self.endless[k] = EndlessCoords(self.generator, seed, self._executor)

@@ -16,7 +16,7 @@ from torch import Tensor
 from poise.env.led import REST, WAITS_S
 from poise.env.recovery.clips import GetUpPlanner, mixed, smooth
 from poise.env.recovery.planner import way_to_stand
-from poise.live.people import Elsewhere
+from poise.live.people import Offset
 from poise.metrics import LOST
 from poise.motion.rotations import facing, heading_angle
 from poise.synthesis.generator import Kinematic
@@ -26,7 +26,7 @@ from poise.synthesis.generator import Kinematic
 PASSES_S, SPEEDS_UP = 1.0, 1.5
 
 
-class Passing:
+class Crossfade:
     """Lets a goal's motion pass into another one without a leap of its root.
 
     Poses are mixed by shares s from 0 to 1. The root's place is not: what moves has gone on by then, and
@@ -73,7 +73,7 @@ class Passing:
         return out
 
 
-class Way:
+class RecoveryMotion:
     """The motion of one character to standing: planned, then followed.
 
     Args:
@@ -132,7 +132,7 @@ class Way:
 AHEAD = 30
 
 
-class Endless:
+class EndlessCoords:
     """Coordinates of a body at the control rate, without end.
 
     Args:
@@ -148,7 +148,7 @@ class Endless:
         self._frames = deque[np.ndarray]()
         self._made: Future[Tensor] | None = None
         self._last: np.ndarray | None = None
-        self._where = Elsewhere()
+        self._where = Offset()
 
     def next(self, waits: bool = False) -> np.ndarray | None:
         """The next frame `(7 + n)`; None before any was made.
@@ -191,7 +191,7 @@ HERE_M, TURNED = 0.25, 0.5
 GRACE_S = 0.3
 
 
-class Body(NamedTuple):
+class CharacterState(NamedTuple):
     """Where a character is.
 
     Attributes:
@@ -207,7 +207,7 @@ class Body(NamedTuple):
     moves: Tensor
 
 
-class Character:
+class CharacterGoals:
     """One character's goals, a frame at a time.
 
     Args:
@@ -240,7 +240,11 @@ class Character:
         self.lost = self.falls = self.recovered = 0
         self.last = self.ease.clone()
         self.anew, self.still = False, True
-        self._way, self._passing, self._step = Way(get_up, executor), Passing(get_up.rate_hz), 0
+        self._way, self._passing, self._step = (
+            RecoveryMotion(get_up, executor),
+            Crossfade(get_up.rate_hz),
+            0,
+        )
         self._grace = self._tries = 0
         self._person: Tensor | None = None
         self._drift = torch.zeros(2, dtype=torch.float64)
@@ -272,7 +276,7 @@ class Character:
         """What comes next is passed into from the last frame: a new person, a jump."""
         self._passing.begin(self.last, self._drift)
 
-    def next(self, person: Tensor | None, body: Body, stalled: bool = False) -> Tensor:
+    def next(self, person: Tensor | None, body: CharacterState, stalled: bool = False) -> Tensor:
         """The goal's next frame `(7 + n)`.
 
         Args:
@@ -285,7 +289,7 @@ class Character:
         self.still = bool((self.last - before).abs().max() < 1e-9)
         return self.last
 
-    def _next(self, person: Tensor | None, body: Body, stalled: bool) -> Tensor:
+    def _next(self, person: Tensor | None, body: CharacterState, stalled: bool) -> Tensor:
         rate, self._step = self.get_up.rate_hz, self._step + 1
         step = self._moved(person)
         stands = float(step.norm()) * rate < STANDS

@@ -137,7 +137,7 @@ class _Answer(NamedTuple):
 
 
 @dataclass(eq=False)
-class _World:
+class _LookingCharacter:
     """A character that looks ahead.
 
     Attributes:
@@ -163,7 +163,7 @@ class AheadBeside:
     def __init__(self, tracker: Tracker, seed: int):
         self._policy = tracker.policy
         self._env: ImitationEnv | None = None
-        self._worlds = dict[int, _World]()
+        self._worlds = dict[int, _LookingCharacter]()
         self.acts, self.decided = False, 0
         context = get_context("spawn")
         self._line, other = context.Pipe()
@@ -171,15 +171,15 @@ class AheadBeside:
         self._process = context.Process(target=_decide_all, args=args, daemon=True)
         self._process.start()
         other.close()
-        self._asks: queue.SimpleQueue[tuple[_World, _Asked] | None] = queue.SimpleQueue()
-        self._told: queue.SimpleQueue[tuple[_World, _Answer]] = queue.SimpleQueue()
+        self._asks: queue.SimpleQueue[tuple[_LookingCharacter, _Asked] | None] = queue.SimpleQueue()
+        self._told: queue.SimpleQueue[tuple[_LookingCharacter, _Answer]] = queue.SimpleQueue()
         self._waiting = False
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
         """See `Ahead`. What was asked before is not waited for."""
-        self._env, self._worlds = env, {k: _World() for k in worlds}
+        self._env, self._worlds = env, {k: _LookingCharacter() for k in worlds}
 
     def act(self, obs: Tensor) -> Tensor:
         """See `Ahead`."""
@@ -204,7 +204,7 @@ class AheadBeside:
         for i, world in self._worlds.items():
             if fresh[i]:
                 # It was set down anew: what is decided by now is of another place.
-                self._worlds[i] = world = _World()
+                self._worlds[i] = world = _LookingCharacter()
             choice = world.choice
             self._ask(i, world, pos[i])
             if choice is not None and world.step < len(choice.offsets):
@@ -218,9 +218,9 @@ class AheadBeside:
 
     def skip(self) -> None:
         """See `Ahead`. What was asked is not waited for."""
-        self._worlds = {k: _World() for k in self._worlds}
+        self._worlds = {k: _LookingCharacter() for k in self._worlds}
 
-    def _ask(self, i: int, world: _World, pos: Tensor) -> None:
+    def _ask(self, i: int, world: _LookingCharacter, pos: Tensor) -> None:
         """Hands a question over, where nothing is being decided and this character's turn has come."""
         env = self._env
         assert env is not None

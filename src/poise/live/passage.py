@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from poise.body import BodyTable
-from poise.kinematics.retarget.passage import Passage, _places
+from poise.kinematics.retarget.passage import Retargeter, _places
 from poise.live.quats import between, conj, matrix, mul, normalized, rotate, slerp
 from poise.motion import Clip, Skeleton
 from poise.motion.roles import SHARED, SIDES
@@ -34,7 +34,7 @@ class FramePassage:
     """
 
     def __init__(self, clip: Clip, onto: Clip, scale: float | None = None):
-        p = Passage.between(clip, onto, None, None, scale)
+        p = Retargeter.between(clip, onto, None, None, scale)
         self.source, self.target = clip.skeleton, onto.skeleton
         self.factor, self.centre = p.scale.factor, np.array(p.scale.centre)
         self._here, self._there = np.array(p.here.rot), np.array(p.there.rot)
@@ -147,7 +147,7 @@ def place_of(
     return root + rotate(world[list(path[:-1])], skeleton.offsets[list(path[1:])]).sum(0)
 
 
-def _chains(p: Passage) -> list[_Chain]:
+def _chains(p: Retargeter) -> list[_Chain]:
     """Spine, neck and head, as `kinematics.retarget.passage` shares their bend out."""
     joints, out = p.joints, list[_Chain]()
     hips = joints.source.joint("hips")

@@ -18,7 +18,7 @@ from poise.kinematics.coords import wrapped
 from poise.kinematics.stream_noise import FadingFilter
 from poise.live import quats as q
 from poise.live.passage import FramePassage, Hinges, doublings, world_of
-from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, Pose, Tremble, leapt
+from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, StreamPose, StreamTremble, leapt
 from poise.motion import Clip, Skeleton
 
 #: s that are stood, m that the root may move meanwhile, and frames a second of what is measured.
@@ -28,7 +28,7 @@ FEWEST = 8
 
 
 @dataclass(eq=False)
-class Elsewhere:
+class Offset:
     """Motion that goes on from elsewhere.
 
     Attributes:
@@ -60,7 +60,7 @@ class Elsewhere:
 
 
 @dataclass(eq=False)
-class OntoBody:
+class Calibration:
     """Poses of one skeleton as coordinates of a body.
 
     `move` lets the motion go on from elsewhere; at first it is where the source has it.
@@ -76,7 +76,7 @@ class OntoBody:
     hinges: Hinges
     feet: dict[int, np.ndarray]
     first: np.ndarray
-    where: Elsewhere = field(default_factory=Elsewhere)
+    where: Offset = field(default_factory=Offset)
     floor: float = 0.0
     planted: np.ndarray | float = 0.0
     _last: np.ndarray | None = None
@@ -94,7 +94,7 @@ class OntoBody:
         example: Clip,
         ease: np.ndarray,
         how: RetargetConfig | None = None,
-    ) -> OntoBody:
+    ) -> Calibration:
         """From a clip that shows how the person stands, and where the floor is.
 
         ease: `(7 + n)`, the body at ease: hinges come as near to those as whole turns let them, since a
@@ -131,11 +131,11 @@ class OntoBody:
         return self.where(qpos)
 
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """See `Elsewhere.move`."""
+        """See `Offset.move`."""
         self.where.move(seen, to)
 
 
-class Standing:
+class StandingMeasure:
     """Collects the seconds in which a person stands, of packets as they come.
 
     Attributes:
@@ -178,10 +178,10 @@ def calibrated(
     example: Clip,
     ease: np.ndarray,
     how: RetargetConfig | None,
-) -> OntoBody | str:
+) -> Calibration | str:
     """The calibration, or a sentence why there is none."""
     try:
-        return OntoBody.by(clip, humanoid, example, ease, how)
+        return Calibration.by(clip, humanoid, example, ease, how)
     except PoiseError as problem:
         return f"{packet.person}: {problem.what}"
 
@@ -203,10 +203,14 @@ class Steady:
         self._busy = Lock()
 
     @property
-    def tremble(self) -> Tremble:
+    def tremble(self) -> StreamTremble:
         """What the person does now."""
         fading = self._fading
-        return Tremble() if fading is None else Tremble(fading.noise.mm, fading.noise.hz, fading.late_s)
+        return (
+            StreamTremble()
+            if fading is None
+            else StreamTremble(fading.noise.mm, fading.noise.hz, fading.late_s)
+        )
 
     def __call__(
         self, time_s: float, root: np.ndarray, rot: np.ndarray
@@ -282,7 +286,7 @@ AWAY_S, FORGET_S = 1.0, 20.0
 STAND = "stand still for 2 s"
 
 #: Makes the calibration of a packet's skeleton from a clip; a sentence where that fails.
-Calibrate = Callable[..., OntoBody | str]
+Calibrate = Callable[..., Calibration | str]
 
 
 class Person:
@@ -295,12 +299,12 @@ class Person:
 
     def __init__(self, name: str, delay_s: float):
         self.name, self.buffer = name, JitterBuffer(delay_s)
-        self.onto: OntoBody | None = None
+        self.onto: Calibration | None = None
         self.said = STAND
         self.arrived_s = -np.inf
         self._first: Packet | None = None
-        self._standing = Standing()
-        self._made: Future[OntoBody | str] | None = None
+        self._standing = StandingMeasure()
+        self._made: Future[Calibration | str] | None = None
 
     @property
     def share(self) -> float:
@@ -316,7 +320,7 @@ class Person:
         if self._first is None:
             self._first = packet
         self.arrived_s = arrived_s
-        p, tremble = packet, packet.tremble or Tremble()
+        p, tremble = packet, packet.tremble or StreamTremble()
         self.buffer.add(p.time_s, arrived_s, p.root_pos, p.rot, p.places, tremble, p.held_s, p.earlier)
         if self.onto is None and self._made is None:
             whole = packet.whole or self._standing.add(packet)
@@ -327,19 +331,19 @@ class Person:
         """Another body stands there: it is calibrated anew."""
         self.buffer = JitterBuffer(self.buffer.delay_s)
         self.onto = self._made = self._first = None
-        self._standing = Standing()
+        self._standing = StandingMeasure()
 
     def ready(self) -> bool:
         """Whether it is calibrated; takes over a calibration that was made beside the loop."""
         if self._made is not None and self._made.done():
             made, self._made = self._made.result(), None
             if isinstance(made, str):
-                self.said, self._standing = made, Standing()
+                self.said, self._standing = made, StandingMeasure()
             else:
                 self.onto = made
         return self.onto is not None
 
-    def read(self, now_s: float) -> Pose | None:
+    def read(self, now_s: float) -> StreamPose | None:
         """Its pose, None before anything came or since it is away."""
         pose = self.buffer.read(now_s)
         return None if pose is None or pose.stale_s > AWAY_S else pose
@@ -347,12 +351,12 @@ class Person:
 
 def calibrate_with(
     calibrate: Callable[..., object], packet: Packet, whole: object
-) -> Future[OntoBody | str]:
+) -> Future[Calibration | str]:
     """The calibration, as a future whatever `calibrate` gives."""
     made = calibrate(packet, whole)
     if isinstance(made, Future):
         return made
-    out: Future[OntoBody | str] = Future()
+    out: Future[Calibration | str] = Future()
     out.set_result(made)  # type: ignore[arg-type]
     return out
 

@@ -18,8 +18,8 @@ from poise.formats.point_fit import fit_clip
 from poise.kinematics.retarget.keypoint_goal import Gaps, PointBody
 from poise.kinematics.stream_noise import FadingFilter, of_points
 from poise.live.people import FEWEST, FORGET_S, STAND_S, STILL_M
-from poise.live.sources import Frame
-from poise.live.stream import PEOPLE, Inbox, Packet, Tremble
+from poise.live.sources import KeypointFrame
+from poise.live.stream import PEOPLE, Inbox, Packet, StreamTremble
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing
@@ -43,7 +43,7 @@ class Performer:
     ):
         self.person, self.names, self._onto, self._table = person, names, onto, table
         self._tells_places = tells_places
-        self._seen = list[Frame]()
+        self._seen = list[KeypointFrame]()
         self._body: PointBody | None = None
         self._whole: Clip | None = None
         self._time: float | None = None
@@ -55,7 +55,7 @@ class Performer:
         self._times, self._fitted = deque[float](maxlen=8), -np.inf
         self.share, self.arrived_s = 0.0, -np.inf
 
-    def take(self, frame: Frame) -> Packet | None:
+    def take(self, frame: KeypointFrame) -> Packet | None:
         """The packet of a frame, None while the person is measured or where too much is missing.
 
         Raises:
@@ -92,7 +92,7 @@ class Performer:
 
     def _smoothed(
         self, whole: np.ndarray, time_s: float, dt: float
-    ) -> tuple[np.ndarray, float, Tremble]:
+    ) -> tuple[np.ndarray, float, StreamTremble]:
         """Points `(K, 3)` of the newest frame that is known well, when it was, and how they tremble."""
         if self._steady is None:
             self._steady = of_points(len(whole))
@@ -104,10 +104,10 @@ class Performer:
         # Of the frames that are known, the one that is kept back by most nearly as much.
         late = [time_s - t for t in list(self._times)[: len(known)]]
         k = int(np.abs(np.array(late) - steady.late_s).argmin())
-        tremble = Tremble(steady.noise.mm, steady.noise.hz, late[k])
+        tremble = StreamTremble(steady.noise.mm, steady.noise.hz, late[k])
         return known[k].reshape(-1, 3), self._times[k], tremble
 
-    def _measure(self, frame: Frame) -> None:
+    def _measure(self, frame: KeypointFrame) -> None:
         seen = self._seen
         if np.isnan(frame.points).all():
             raise PoiseError("keypoints are missing", self.person, code="keypoints-unseen")
@@ -158,7 +158,7 @@ class PointFit:
         self.inbox, self._onto, self._table = inbox, onto, table
         self._tells_places = tells_places
         self._people = dict[str, Performer]()
-        self._waiting: queue.Queue[Frame | None] = queue.Queue(WAIT)
+        self._waiting: queue.Queue[KeypointFrame | None] = queue.Queue(WAIT)
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
@@ -171,14 +171,14 @@ class PointFit:
             self._waiting.put(None)
             self._thread.join(2.0)
 
-    def offer(self, frame: Frame) -> None:
+    def offer(self, frame: KeypointFrame) -> None:
         """Takes a frame; returns at once. Where too many wait it is left out."""
         try:
             self._waiting.put_nowait(frame)
         except queue.Full:
             self.inbox.refuse("too many keypoints")
 
-    def fit(self, frame: Frame) -> None:
+    def fit(self, frame: KeypointFrame) -> None:
         """Fits a frame now."""
         known = self._people.get(frame.person)
         if known is None or known.names != frame.names:

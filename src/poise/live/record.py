@@ -23,7 +23,7 @@ from poise.motion import Clip
 WAIT, EVERY_S = 900, 0.4
 
 
-class Recorder:
+class CharacterRecorder:
     """Records characters of one body.
 
     Each goes into a CSV of Poise's own, NAME-1.csv for the first of several, which a file of the suffix

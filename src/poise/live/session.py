@@ -22,18 +22,18 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
-from poise.live.aims import Aims
+from poise.live.aims import Targets
 from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
 from poise.live.commands import LiveConfig
 from poise.live.page.server import PageServer, as_json, packed
 from poise.live.people import STAND, Steady
 from poise.live.points import PointFit
-from poise.live.record import Recorder
+from poise.live.record import CharacterRecorder
 from poise.live.sockets import Guard, StreamDoor
 from poise.live.sources import FileSource
-from poise.live.stream import Inbox, Tremble
+from poise.live.stream import Inbox, StreamTremble
 from poise.live.vmc import NEEDED, PARENTS, OwnPuppet, VmcSink, VmcSource
-from poise.live.world import Seen, World
+from poise.live.world import LiveStep, LiveWorld
 from poise.motion import Clip
 from poise.synthesis.generator import Kinematic
 
@@ -43,7 +43,7 @@ MOST_ORDERS = 256
 HOLDS_S = 1.0
 
 
-class Orders:
+class CommandQueue:
     """Commands that wait, and what they change.
 
     Attributes:
@@ -53,7 +53,7 @@ class Orders:
         pulled: when each character was last pulled at, by the loop's clock.
     """
 
-    def __init__(self, aims: Aims):
+    def __init__(self, aims: Targets):
         self.aims, self.world = aims, aims.world
         self.waiting: deque[dict[str, Any]] = deque(maxlen=MOST_ORDERS)
         self.paused = False
@@ -183,7 +183,7 @@ class Times:
         }
 
 
-def figures(aims: Aims, inbox: Inbox, times: Times) -> dict[str, Any]:
+def figures(aims: Targets, inbox: Inbox, times: Times) -> dict[str, Any]:
     """Those of the people and characters; times in ms, over the last minute."""
     world, people = aims.world, aims.people
     return {
@@ -200,20 +200,20 @@ def figures(aims: Aims, inbox: Inbox, times: Times) -> dict[str, Any]:
             for p in people.known.values()
         ]
         + [
-            {"name": name, "calibrated": round(share, 2), "said": STAND, **_of_tremble(Tremble())}
+            {"name": name, "calibrated": round(share, 2), "said": STAND, **_of_tremble(StreamTremble())}
             for name, share in list(inbox.standing.items())
         ],
         "characters": [_of_character(aims, k) for k in range(world.count)],
     }  # fmt: skip
 
 
-def _of_tremble(tremble: Tremble) -> dict[str, Any]:
+def _of_tremble(tremble: StreamTremble) -> dict[str, Any]:
     """By how many mm a person trembles, at how many Hz, and how many ms later it is followed."""
     hz = None if tremble.hz is None else round(tremble.hz, 1)
     return {"trembles_mm": round(tremble.mm), "hz": hz, "late_ms": round(1000.0 * tremble.late_s)}
 
 
-def _of_character(aims: Aims, k: int) -> dict[str, Any]:
+def _of_character(aims: Targets, k: int) -> dict[str, Any]:
     c, world = aims.world.characters[k], aims.world
     return {
         "follows": aims.people.follows[k], "doing": c.doing, "lost": c.lost, "falls": c.falls,
@@ -232,7 +232,7 @@ def _percentiles(seconds: deque[float]) -> list[float]:
 DOING = (EASE, TRACKS, FALLS, RETURNS)
 
 
-def hello_of(world: World, names: dict[str, Any]) -> dict[str, Any]:
+def hello_of(world: LiveWorld, names: dict[str, Any]) -> dict[str, Any]:
     """What a page needs to draw the characters.
 
     names: more of it, such as whether there is a recorder.
@@ -261,7 +261,7 @@ class ShowPage:
     def __init__(self, server: PageServer):
         self.server = server
 
-    def show(self, seen: Seen, live: Live) -> None:
+    def show(self, seen: LiveStep, live: Live) -> None:
         """Takes a control step."""
         doing = [c.doing for c in live.world.characters]
         frame = packed(
@@ -273,10 +273,10 @@ class ShowPage:
 class ShowRecorder:
     """Hands steps to a recording while it is on."""
 
-    def __init__(self, recorder: Recorder):
+    def __init__(self, recorder: CharacterRecorder):
         self.recorder = recorder
 
-    def show(self, seen: Seen, live: Live) -> None:
+    def show(self, seen: LiveStep, live: Live) -> None:
         """Takes a control step."""
         self.recorder.write(seen.qpos)
 
@@ -287,7 +287,7 @@ class ShowVmc:
     def __init__(self, sink: VmcSink):
         self.sink = sink
 
-    def show(self, seen: Seen, live: Live) -> None:
+    def show(self, seen: LiveStep, live: Live) -> None:
         """Takes a control step."""
         own = live.aims.own(self.sink.character)
         if own is not None and not set(NEEDED) <= set(own.skeleton.names) <= set(PARENTS):
@@ -303,7 +303,7 @@ HURRIES_S = 2.0
 class Shows(Protocol):
     """What a step's outcome goes to; it returns at once."""
 
-    def show(self, seen: Seen, live: Live) -> None:
+    def show(self, seen: LiveStep, live: Live) -> None:
         """Takes a control step."""
         ...
 
@@ -338,9 +338,9 @@ class Live:
         self.config = c = config or LiveConfig()
         self.tracker, self.inbox, self.shows = tracker, inbox or Inbox(Steady), list(shows)
         ahead, beside = tuple(range(c.lookahead)), executor is not None
-        self.world = World(tracker, c.characters, executor, ahead, c.seed, beside)
-        self.aims = Aims(self.world, c, executor, generator)
-        self.people, self.orders = self.aims.people, Orders(self.aims)
+        self.world = LiveWorld(tracker, c.characters, executor, ahead, c.seed, beside)
+        self.aims = Targets(self.world, c, executor, generator)
+        self.people, self.orders = self.aims.people, CommandQueue(self.aims)
         self.commands = self.orders.waiting
         self.rate_hz, self.clock = self.world.rate_hz, clock
         self.behind, self._hurry, self.times = 0, 0, Times()
@@ -374,7 +374,7 @@ class Live:
             self.step(now)
             due += self._phase.shift(due)
 
-    def step(self, now_s: float) -> Seen | None:
+    def step(self, now_s: float) -> LiveStep | None:
         """One control step at `now_s`; None while paused."""
         began = self.clock()
         packets = self.inbox.take()
@@ -410,7 +410,7 @@ FEWEST, SWITCH_S = 3, 0.0005
 
 
 @dataclass(frozen=True)
-class Wanted:
+class SessionConfig:
     """What a session is made of.
 
     Attributes:
@@ -443,13 +443,13 @@ class Session:
         PoiseError: a port that is taken, a policy that cannot get up, a format that cannot be written.
     """
 
-    def __init__(self, tracker: Tracker, config: LiveConfig, wanted: Wanted):
+    def __init__(self, tracker: Tracker, config: LiveConfig, wanted: SessionConfig):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="poise-live")
         self.inbox, clock = Inbox(Steady), time.perf_counter
         made = generator_for(tracker)
         self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock, generator=made)
         world = self.live.world
-        self.recorder = Recorder(
+        self.recorder = CharacterRecorder(
             wanted.record, world.humanoid.table, tracker.example, world.count, world.rate_hz
         )
         self.recorded: list[Path] = []

@@ -116,7 +116,7 @@ class Bucket:
 A_SECOND, WAITING = 200, 512
 
 
-class Doorway(socket.socket):
+class GuardedSocket(socket.socket):
     """Listens where a guard says; `accept` gives only what it lets in.
 
     Raises:

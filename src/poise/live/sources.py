@@ -142,7 +142,7 @@ def packet_of(name: str, loop: Loop, frame: int) -> Packet:
     return Packet(name, frame / loop.clip.fps, loop.clip.skeleton, root, rot, loop.clip)
 
 
-class Frame(NamedTuple):
+class KeypointFrame(NamedTuple):
     """Keypoints `(K, 3)` m of a person, Z up, NaN where one is missing, and when they were and came."""
 
     person: str
@@ -155,7 +155,7 @@ class Frame(NamedTuple):
 class Fits(Protocol):
     """What frames go to."""
 
-    def offer(self, frame: Frame) -> None:
+    def offer(self, frame: KeypointFrame) -> None:
         """Takes a frame; returns at once."""
         ...
 
@@ -224,4 +224,4 @@ class JsonStream:
             return
         points = points_of(message, len(labels))
         time_s = number(message["time"]) if "time" in message else arrived_s
-        self._points.offer(Frame((self._own + person)[:64], labels, points, time_s, arrived_s))
+        self._points.offer(KeypointFrame((self._own + person)[:64], labels, points, time_s, arrived_s))

@@ -26,7 +26,7 @@ FAR_M = 1000.0
 NAME = 64
 
 
-class Tremble(NamedTuple):
+class StreamTremble(NamedTuple):
     """What a person was found to do: mm that it trembles by, 0 for one that is left as it is; Hz of a
     tremble of one frequency; s by which it is read later, to be smoothed."""
 
@@ -68,7 +68,7 @@ class Packet:
     rot: np.ndarray
     whole: Clip | None = None
     places: np.ndarray | None = None
-    tremble: Tremble | None = None
+    tremble: StreamTremble | None = None
     held_s: float = 0.0
     earlier: tuple[Earlier, ...] = ()
 
@@ -104,7 +104,7 @@ class Smooths(Protocol):
     skeleton: Skeleton
 
     @property
-    def tremble(self) -> Tremble:
+    def tremble(self) -> StreamTremble:
         """What the person does now."""
         ...
 
@@ -208,7 +208,7 @@ JUMP, LEAP_M = 12.0, 0.4
 #: Packets by which the way's shortest time is known, and those that are kept.
 SEEN, KEPT = 240, 320
 
-NONE = Tremble()
+NONE = StreamTremble()
 
 
 def margin(delay_s: float) -> float:
@@ -222,7 +222,7 @@ def leapt(before: np.ndarray, root_pos: np.ndarray, dt: float) -> bool:
     return far > LEAP_M and far > JUMP * dt
 
 
-class Pose(NamedTuple):
+class StreamPose(NamedTuple):
     """A pose that was read.
 
     Attributes:
@@ -266,7 +266,7 @@ class JitterBuffer:
     """
 
     def __init__(self, delay_s: float = 0.1):
-        self.delay_s, self.tremble = delay_s, Tremble()
+        self.delay_s, self.tremble = delay_s, StreamTremble()
         self.late = self.jumps = 0
         self._frames: deque[_Frame] = deque(maxlen=KEPT)
         self._ways: deque[float] = deque(maxlen=SEEN)
@@ -284,7 +284,7 @@ class JitterBuffer:
         root_pos: np.ndarray,
         rot: np.ndarray,
         places: np.ndarray | None = None,
-        tremble: Tremble = NONE,
+        tremble: StreamTremble = NONE,
         held_s: float = 0.0,
         earlier: Sequence[Earlier] = (),
     ) -> None:
@@ -315,7 +315,7 @@ class JitterBuffer:
         self.tremble = tremble
         frames.append(_Frame(time_s, root_pos, rot, leaps, places))
 
-    def read(self, now_s: float) -> Pose | None:
+    def read(self, now_s: float) -> StreamPose | None:
         """The pose at `now_s` by the loop's clock; None before anything has come."""
         frames = self._frames
         if not frames:
@@ -335,12 +335,12 @@ class JitterBuffer:
             a, b = frames[after], frames[after + 1]
             share = 0.0 if b.leaps else (at - a.time_s) / (b.time_s - a.time_s)
         if share == 0.0:
-            return Pose(a.root_pos, a.rot, stale, jumped, a.places, stalled)
+            return StreamPose(a.root_pos, a.rot, stale, jumped, a.places, stalled)
         places = None
         if a.places is not None and b.places is not None:
             places = a.places + share * (b.places - a.places)
         root = a.root_pos + share * (b.root_pos - a.root_pos)
-        return Pose(root, slerp(a.rot, b.rot, share), stale, jumped, places, stalled)
+        return StreamPose(root, slerp(a.rot, b.rot, share), stale, jumped, places, stalled)
 
     def _kept_back(self, now_s: float) -> float:
         """s, that of the tremble; it comes and goes gently."""

@@ -18,7 +18,7 @@ from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.live import quats as q
 from poise.live.passage import FramePassage, local_of, world_of
-from poise.live.people import Elsewhere
+from poise.live.people import Offset
 from poise.live.sockets import Listener
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip, Skeleton
@@ -430,7 +430,7 @@ class Own(NamedTuple):
     skeleton: Skeleton
     root_pos: np.ndarray
     rot: np.ndarray
-    where: Elsewhere
+    where: Offset
     factor: float
 
 

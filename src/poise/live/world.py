@@ -23,7 +23,7 @@ from poise.errors import PoiseError
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
-from poise.live.characters import FALLS, Body, Character
+from poise.live.characters import FALLS, CharacterGoals, CharacterState
 from poise.live.lookahead import Ahead, AheadAtOnce, AheadBeside
 from poise.sim import Backend, CharacterRows, Drive, Scene, SceneSim, alone
 from poise.sim import Character as Actor
@@ -35,7 +35,7 @@ PULL, DAMP, MOST_N = 400.0, 40.0, 500.0
 BLOW_NS, BLOW_S = 150.0, 0.1
 
 
-class Hands(Plugin):
+class PushInput(Plugin):
     """One hand and one blow on each of K characters; their forces are held for a control step."""
 
     def __init__(self, goal: Goal, backend: Backend):
@@ -97,7 +97,7 @@ APART_M, AWAY = 2.0, (0.0, 400.0, 0.15)
 BALL_MPS = 4.0
 
 
-class Seen(NamedTuple):
+class LiveStep(NamedTuple):
     """What a control step came to, for those that show it.
 
     Attributes:
@@ -117,7 +117,7 @@ class Seen(NamedTuple):
     off_m: np.ndarray
 
 
-class World:
+class LiveWorld:
     """K characters that follow streams, without help.
 
     Args:
@@ -160,7 +160,7 @@ class World:
         task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
         # The dials begin at 0, where nothing gives way.
         yields = Compliance(level=0.0)
-        own = replace(task.task, help_by="all", compliance=yields, plugins=(Hands,))
+        own = replace(task.task, help_by="all", compliance=yields, plugins=(PushInput,))
         task = replace(task, task=own)
         body, sim = task.humanoid, task.config.sim
         self.humanoid, self.rate_hz = body, sim.control_hz
@@ -171,14 +171,14 @@ class World:
         # Snapshots are of a character alone, so that lookahead can try with it.
         self.rows = CharacterRows(self.scene.backend, places, alone(body, sim), self.scene)
         self.env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=self.rows)
-        hands, yielding = self.env.plugin(Hands), self.env.plugin(Yielding)
+        hands, yielding = self.env.plugin(PushInput), self.env.plugin(Yielding)
         assert hands is not None and yielding is not None
         self.hands, self.yielding = hands, yielding
         self.goal = StreamGoal(body, self.rate_hz, count, seed=seed)
         planner = GetUpPlanner(tracker.recovery_clips, body.table, self.rate_hz)
         wide = int(np.ceil(np.sqrt(count)))
         spots = [(APART_M * (k // wide), APART_M * (k % wide)) for k in range(count)]
-        self.characters = [Character(planner, spot, executor) for spot in spots]
+        self.characters = [CharacterGoals(planner, spot, executor) for spot in spots]
         self.substeps, self.resets, self.steps, self.unwound = sim.substeps, 0, 0, 0
         self._range = torch.from_numpy(body.model.jnt_range[1:].T.copy()).to(self.rows.state.qpos)
         self.lead, self._full = [1] * count, 1
@@ -245,9 +245,9 @@ class World:
 
     # --- stepping -----------------------------------------------------------------------------
 
-    def body(self, character: int) -> Body:
+    def body(self, character: int) -> CharacterState:
         """Where a character is."""
-        return Body(
+        return CharacterState(
             self.rows.state.qpos[character].double(),
             float(self._off[character]),
             float(self._speed[character]),
@@ -268,7 +268,7 @@ class World:
             elif character.still:
                 self.lead[k] = min(self._full, self.lead[k] + 1)
 
-    def step(self, frames: Tensor, places: Tensor | None = None) -> Seen:
+    def step(self, frames: Tensor, places: Tensor | None = None) -> LiveStep:
         """One control step toward the frames `(K, 7 + n)`, the newest that the goals know.
 
         places: see `StreamGoal.push`.
@@ -315,7 +315,7 @@ class World:
                 self.unwound += 1
                 self.rows.write(torch.tensor([k]), qpos[None], state.qvel[k].clone()[None])
 
-    def _seen(self) -> Seen:
+    def _seen(self) -> LiveStep:
         pose, goal, state = self.env.here(), self.env.goal_pose(), self.scene.backend.state
         self._off = (pose.pos - goal.pos).norm(dim=-1).mean(-1).double().numpy()
         self._speed = pose.linvel.norm(dim=-1).mean(-1).double().numpy()
@@ -324,7 +324,7 @@ class World:
         bodies, goals = (torch.cat((p.pos, p.quat), -1).float().numpy().copy() for p in (pose, goal))
         ball = state.qpos[0, at].float().numpy().copy()
         qpos = self.rows.state.qpos.double().numpy().copy()
-        return Seen(self.steps / self.rate_hz, bodies, goals, ball, qpos, self._off)
+        return LiveStep(self.steps / self.rate_hz, bodies, goals, ball, qpos, self._off)
 
     def close(self) -> None:
         """Frees the simulations."""

@@ -22,7 +22,7 @@ _LEG_WORDS = ("hip", "leg", "thigh", "femur", "knee", "tibia", "shin", "ankle", 
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"))
 
 
-class Seen(NamedTuple):
+class NoiseInput(NamedTuple):
     """What noise acts on: named points, or a pose.
 
     pos: `(T, K, 3)` m, NaN where a point is missing; of a pose the root alone, `(T, 1, 3)`.
@@ -47,7 +47,7 @@ class Noise(Checked):
     strength: NotNegative = 1.0
     seed: int = 0
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         """What is seen with this noise."""
         raise PoiseError(f"{type(self).__name__} does not say what it does", code="not-implemented")
 
@@ -157,7 +157,7 @@ class Jitter(Noise):
     axis: Vector = (1.0, 0.0, 0.0)
     axis_ratio: NotNegative = 1.0
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         way, frames = _unit(self.axis), len(seen.pos)
         path = smooth_path(rng, frames, seen.pos.shape[1:], seen.fps, self.tau_s)
         path = path + (self.axis_ratio - 1.0) * (path @ way)[..., None] * way
@@ -179,7 +179,7 @@ class Outliers(Noise):
     size_m: NotNegative = 0.035
     size_rad: NotNegative = 0.1
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         size, shape = (self.size_m, seen.pos.shape[:2])
         if seen.rot is not None:
             size, shape = (self.size_rad, seen.rot.shape[:2])
@@ -197,7 +197,7 @@ class Drift(Noise):
     sigma_m: Annotated[Vector, Range(0)] = (0.045, 0.045, 0.045)
     tau_s: NotNegative = 0.8
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         path = wandering_path(rng, len(seen.pos), (3,), seen.fps, self.tau_s)
         return seen._replace(pos=seen.pos + (self.strength * np.array(self.sigma_m) * path)[:, None])
 
@@ -216,7 +216,7 @@ class WrongDepth(Noise):
     axis: Vector = (1.0, 0.0, 0.0)
     camera: Vector | None = None
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         pos, way = seen.pos, _unit(self.axis)
         wrong = self.bias + self.sigma * wandering_path(rng, len(pos), (), seen.fps, self.tau_s)
         if self.camera is None:
@@ -236,14 +236,14 @@ class Dropouts(Noise):
     share: NotNegative = 0.04
     mean_s: NotNegative = 0.19
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         if seen.rot is None:
             lost = self._lost(rng, seen, seen.pos.shape[1])
             return seen._replace(pos=np.where(lost[..., None], np.nan, seen.pos))
         at = last_seen(self._lost(rng, seen, seen.rot.shape[1]))
         return seen._replace(rot=np.take_along_axis(seen.rot, at[..., None], 0))
 
-    def _lost(self, rng: np.random.Generator, seen: Seen, count: int) -> np.ndarray:
+    def _lost(self, rng: np.random.Generator, seen: NoiseInput, count: int) -> np.ndarray:
         """`(T, count)`, what is missing when."""
         share = min(self.share * self.strength, 1.0)
         return spell_mask(rng, len(seen.pos), count, seen.fps, share, self.mean_s)
@@ -256,7 +256,7 @@ class FrameLoss(Dropouts):
     share: NotNegative = 0.03
     mean_s: NotNegative = 0.1
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         lost = self._lost(rng, seen, 1)
         if seen.rot is None:
             return seen._replace(pos=np.where(lost[..., None], np.nan, seen.pos))
@@ -271,7 +271,7 @@ class SwapSides(Noise):
     share: NotNegative = 0.02
     mean_s: NotNegative = 0.15
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         values = seen.pos if seen.rot is None else seen.rot
         share = min(self.share * self.strength, 1.0)
         wrong = spell_mask(rng, len(values), 2, seen.fps, share, self.mean_s)
@@ -288,7 +288,7 @@ class Latency(Noise):
 
     seconds: NotNegative = 0.1
 
-    def on(self, seen: Seen, rng: np.random.Generator) -> Seen:
+    def on(self, seen: NoiseInput, rng: np.random.Generator) -> NoiseInput:
         del rng
         late = seen._replace(pos=self._late(seen.pos, seen.fps))
         if seen.rot is None:
@@ -360,7 +360,7 @@ def perturb_clip(clip: Clip, noise: Noise | Sequence[Noise], seed: int = 0) -> C
 
     The numbers depend on `seed`, on each noise's own seed and place, and on the clip's name.
     """
-    seen = Seen(clip.root_pos[:, None], clip.rot, clip.fps, side_pairs(clip.skeleton.names))
+    seen = NoiseInput(clip.root_pos[:, None], clip.rot, clip.fps, side_pairs(clip.skeleton.names))
     for one, rng in _each(noise, seed, clip.name):
         seen = one.on(seen, rng)
     return clip.replaced(root_pos=seen.pos[:, 0], rot=seen.rot)
@@ -385,7 +385,7 @@ def perturb_positions(
         raise PoiseError(
             f"positions must be (T, {len(names)}, 3), got {positions.shape}", code="wrong-shape"
         )
-    seen = Seen(np.asarray(positions, dtype=float), None, fps, side_pairs(tuple(names)))
+    seen = NoiseInput(np.asarray(positions, dtype=float), None, fps, side_pairs(tuple(names)))
     for one, rng in _each(noise, seed, name):
         seen = one.on(seen, rng)
     return seen.pos

@@ -98,7 +98,7 @@ class Changes(NamedTuple):
     much: Tensor
 
 
-class Tried(NamedTuple):
+class CandidateScores(NamedTuple):
     """What N copies of G worlds came to.
 
     Attributes:
@@ -141,7 +141,9 @@ class Candidates:
         self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
         self.steps = 0
 
-    def tried(self, snapshot: Snapshot, changes: Changes, past: Tensor, groups: int = 1) -> Tried:
+    def tried(
+        self, snapshot: Snapshot, changes: Changes, past: Tensor, groups: int = 1
+    ) -> CandidateScores:
         """What the copies come to from a snapshot of one world or of N.
 
         Args:
@@ -187,7 +189,7 @@ class Candidates:
         each = n // groups
         aims = torch.stack(ref_pos[1:] or ref_pos, 1).repeat_interleave(each, 0)
         off = (torch.stack(pos[1:] or pos, 1) - aims).norm(dim=-1)
-        return Tried(cost, lost, ended, rough, source, off)
+        return CandidateScores(cost, lost, ended, rough, source, off)
 
 
 #: Copies below which there is nothing to choose from.

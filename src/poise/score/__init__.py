@@ -1,6 +1,15 @@
 """Evaluation: padded rollouts in, a score card with stable keys out."""
 
-from poise.score.card import THRESHOLDS, Help, Row, ScoreCard, Threshold, read_score, table, write_score
+from poise.score.card import (
+    THRESHOLDS,
+    CardRow,
+    Help,
+    ScoreCard,
+    Threshold,
+    read_score,
+    table,
+    write_score,
+)
 from poise.score.episodes import (
     Nothing,
     Observer,
@@ -21,6 +30,7 @@ from poise.score.scorecard import TRACKING, clip_figures, score_rollouts
 __all__ = [
     "THRESHOLDS",
     "TRACKING",
+    "CardRow",
     "ClipJudge",
     "ClipResults",
     "Help",
@@ -30,7 +40,6 @@ __all__ = [
     "Recording",
     "RecoveryCard",
     "RolloutSet",
-    "Row",
     "ScoreCard",
     "Threshold",
     "Transitions",

@@ -254,7 +254,7 @@ THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
 reference's jerk."""
 
 
-class Row(NamedTuple):
+class CardRow(NamedTuple):
     """One line of the table; `value` is NaN where nothing was measured."""
 
     label: str
@@ -289,38 +289,38 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
         return "" if card.cut and verdict != "poor" else verdict
 
     rows: list[tuple[str, float, str, Verdict]] = [
-        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
+        CardRow(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
         *_beside(card, "succ", "Success", "%", 100.0),
     ]
     if math.isfinite(card.tracked):
-        rows.append(Row("Tracked", 100.0 * card.tracked, "%", t["tracked"].verdict(card.tracked)))
+        rows.append(CardRow("Tracked", 100.0 * card.tracked, "%", t["tracked"].verdict(card.tracked)))
     for key, label, unit in _ROWS:
         value = getattr(card, key)
         reference = card.reference.get(key, math.nan)
         if key == "jerk":
             ratio = value / reference if reference > 0 else math.nan
-            rows.append(Row(label, value, unit, judged("jerk_ratio", ratio)))
+            rows.append(CardRow(label, value, unit, judged("jerk_ratio", ratio)))
         else:
             rows += [
-                Row(label, value, unit, judged(key, value)),
+                CardRow(label, value, unit, judged(key, value)),
                 *_beside(card, key, label, unit),
             ]
         if math.isfinite(reference):
-            rows.append(Row(f"{label}, reference", reference, unit, ""))
+            rows.append(CardRow(f"{label}, reference", reference, unit, ""))
     aid = card.help
     share = t["share_of_body_weight"].verdict(aid.share_of_body_weight)
     torque = t["torque_mean_nm"].verdict(aid.torque_mean_nm)
     rows += [
-        Row("Help, share of body weight", 100.0 * aid.share_of_body_weight, "%", share),
-        Row("Help, mean force", aid.force_mean_n, "N", ""),
-        Row("Help, mean torque", aid.torque_mean_nm, "N m", torque),
-        Row("Help, mean power", aid.work_j_per_s, "J/s", ""),
-        Row("Reward per step", card.reward.get("total", math.nan), "", ""),
+        CardRow("Help, share of body weight", 100.0 * aid.share_of_body_weight, "%", share),
+        CardRow("Help, mean force", aid.force_mean_n, "N", ""),
+        CardRow("Help, mean torque", aid.torque_mean_nm, "N m", torque),
+        CardRow("Help, mean power", aid.work_j_per_s, "J/s", ""),
+        CardRow("Reward per step", card.reward.get("total", math.nan), "", ""),
     ]
     return rows
 
 
-def _beside(card: ScoreCard, key: str, label: str, unit: str, times: float = 1.0) -> list[Row]:
+def _beside(card: ScoreCard, key: str, label: str, unit: str, times: float = 1.0) -> list[CardRow]:
     """What stands beside a figure of tracking, as far as it was measured."""
     uncut = card.variants.get(f"uncut_{card.weighting}", {}).get(key, math.nan)
     # Without a failure all frames count anyway.
@@ -330,4 +330,4 @@ def _beside(card: ScoreCard, key: str, label: str, unit: str, times: float = 1.0
         (f"spread over {card.starts} starts", card.spread.get(key, math.nan)),
         ("doing nothing", card.nothing.get(key, math.nan)),
     )
-    return [Row(f"{label}, {w}", times * v, unit, "") for w, v in found if math.isfinite(v)]
+    return [CardRow(f"{label}, {w}", times * v, unit, "") for w, v in found if math.isfinite(v)]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.transition import Filled, Known, TransitionNet
+from poise.learn.transition import FilledGap, Known, TransitionNet
 from poise.metrics import l2p, l2q, npss, physics
 from poise.motion.rotations import forward_kinematics
 from poise.motion.windows import (
@@ -108,7 +108,7 @@ class TestSet(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Row:
+class GapRow:
     """One method at one length: L2P, L2Q and NPSS, Skeleton2Humanoid's FP (mm), FQ, JQ, SM (mm), the
     seconds one sequence took, and how far a foot joint slides per frame where the recorded one stands
     (mm): FP and FQ say nothing where no joint's centre ever sinks below the floor."""
@@ -151,13 +151,13 @@ def deviation(train: FrameBank, protocol: Protocol) -> Tensor:
     return train_statistics(train, protocol.train_window, protocol.train_offset, protocol.past - 1)[1]
 
 
-def score(test: TestSet, filled: Filled, length: int, seconds: float = 0.0) -> Row:
+def score(test: TestSet, filled: FilledGap, length: int, seconds: float = 0.0) -> GapRow:
     """The figures of transitions of all windows of a test set."""
     pos, quat = test.truth(length)
     mine, turned = forward_kinematics(
         test.parents, test.offsets[:, None], filled.root.to(pos), filled.rot.to(pos)
     )
-    return Row(
+    return GapRow(
         length,
         float(l2p(mine, pos, test.std)),
         float(l2q(turned, quat)),
@@ -183,7 +183,7 @@ def slide(test: TestSet, pos: Tensor, length: int) -> float:
 
 
 @torch.no_grad()
-def predict(net: TransitionNet, test: TestSet, length: int, batch: int = 256) -> tuple[Filled, float]:
+def predict(net: TransitionNet, test: TestSet, length: int, batch: int = 256) -> tuple[FilledGap, float]:
     """Transitions of all windows in float32 where the network has weights, and seconds a sequence."""
     begun = time.perf_counter()
     dtype = next((p.dtype for p in net.parameters()), test.root.dtype)
@@ -191,7 +191,7 @@ def predict(net: TransitionNet, test: TestSet, length: int, batch: int = 256) ->
     for low in range(0, len(test.root), batch):
         known = Known(*(x.to(dtype) for x in test.known(length, slice(low, low + batch))))
         parts.append(net.fill(known, length))
-    filled = Filled(*(torch.cat(x) for x in zip(*parts, strict=True)))
+    filled = FilledGap(*(torch.cat(x) for x in zip(*parts, strict=True)))
     return filled, (time.perf_counter() - begun) / len(test.root)
 
 
@@ -200,7 +200,7 @@ def evaluate(
     test: TestSet,
     lengths: Sequence[int] | None = None,
     adapted: Callable[[TransitionNet, int], TransitionNet] | None = None,
-) -> list[Row]:
+) -> list[GapRow]:
     """A row per length. adapted: gives the network for a length, such as after test-time adaptation."""
     rows = []
     for n in lengths or test.protocol.lengths:

@@ -146,7 +146,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
         )
 
 
-class Judged(NamedTuple):
+class EpisodeOutcomes(NamedTuple):
     """won `(E,)`: reached the end and broke the rule in no frame. mask `(E, T)`: the frames that count,
     up to and including the first that broke the rule, since what comes after is not tracking. failed_at
     `(E,)`: the frame of failure, -1 for none; the last one where an episode was stopped early. uncut
@@ -159,7 +159,7 @@ class Judged(NamedTuple):
     uncut: Tensor
 
 
-def judge(r: RolloutSet, rule: SuccessRule) -> Judged:
+def judge(r: RolloutSet, rule: SuccessRule) -> EpisodeOutcomes:
     """Judges every episode by `rule`; a state that is not finite fails and counts in no figure."""
     valid = r.valid
     frame = torch.arange(r.pos.shape[1], device=r.pos.device)
@@ -180,7 +180,7 @@ def judge(r: RolloutSet, rule: SuccessRule) -> Judged:
     mask = uncut & (frame <= last.unsqueeze(-1))
     # An episode that was stopped without breaking the rule failed at its last valid frame.
     stopped = torch.where(outcome.first_fail >= 0, outcome.first_fail, valid.sum(1) - 1)
-    return Judged(won, mask, torch.where(won, -1, stopped), uncut)
+    return EpisodeOutcomes(won, mask, torch.where(won, -1, stopped), uncut)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,11 @@ from poise.sim.cpu import CpuBackend
 from poise.sim.drive import Drive
 from poise.sim.floor import Floor, HeightField, Plane, Steps
 from poise.sim.guard import Cause, Failure, NanGuard, Replay, UnstableError, diagnose, replay_dump
-from poise.sim.links import Link, Place
+from poise.sim.links import Link, ModelSlices
 from poise.sim.make import check_device, make_backend
 from poise.sim.mechanics import Mechanics, difference, displaced
 from poise.sim.scene import Character, Scene, SceneModel, Touch, alone
-from poise.sim.scene_sim import CharacterRows, Contact, Pull, SceneSim
+from poise.sim.scene_sim import CharacterRows, Contact, LinkForce, SceneSim
 from poise.sim.warp import WarpBackend
 from poise.sim.worlds import add_contact_sensors, contact_columns
 
@@ -40,11 +40,11 @@ __all__ = [
     "Floor",
     "HeightField",
     "Link",
+    "LinkForce",
     "Mechanics",
+    "ModelSlices",
     "NanGuard",
-    "Place",
     "Plane",
-    "Pull",
     "Replay",
     "Scene",
     "SceneModel",

@@ -107,7 +107,7 @@ _JOINT, _SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
 
 
 @dataclass(frozen=True)
-class Place:
+class ModelSlices:
     """The rows of one thing; each is one slice of MuJoCo's arrays.
 
     Attributes:
@@ -137,7 +137,7 @@ class Place:
         return self.qpos.stop - self.qpos.start
 
 
-def place_of(model: mujoco.MjModel, name: str, body: int) -> Place:
+def place_of(model: mujoco.MjModel, name: str, body: int) -> ModelSlices:
     """The place of the tree of bodies that begins at `body`, a child of the world."""
     bodies = np.flatnonzero(model.body_rootid == body)
     joints = np.flatnonzero(np.isin(model.jnt_bodyid, bodies))
@@ -148,7 +148,7 @@ def place_of(model: mujoco.MjModel, name: str, body: int) -> Place:
     at, by = model.actuator_trnid[:, 0], model.actuator_trntype
     sites = np.flatnonzero(np.isin(model.site_bodyid, bodies))
     driven = (by == _JOINT) & np.isin(at, joints) | (by == _SITE) & np.isin(at, sites)
-    return Place(
+    return ModelSlices(
         name,
         _slice(name, bodies),
         _slice(name, np.concatenate(coordinates) if coordinates else np.array([], int)),

@@ -23,7 +23,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.settings import Length, validate
 from poise.sim.backend import SimConfig
 from poise.sim.floor import Floor, Plane
-from poise.sim.links import Link, Place, place_of
+from poise.sim.links import Link, ModelSlices, place_of
 from poise.sim.props import Prop
 
 #: Things in one scene; more take minutes to compile and are a mistake.
@@ -215,9 +215,9 @@ class SceneModel:
 
     scene: Scene
     model: mujoco.MjModel
-    places: Mapping[str, Place]
+    places: Mapping[str, ModelSlices]
 
-    def place(self, name: str) -> Place:
+    def place(self, name: str) -> ModelSlices:
         """Where a thing stands in the model's arrays."""
         if name not in self.places:
             hint = did_you_mean(name, list(self.places))

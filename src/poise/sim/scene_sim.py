@@ -16,7 +16,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.sim.backend import Backend, SimState
 from poise.sim.drive import Drive
-from poise.sim.links import FAR_M, Place
+from poise.sim.links import FAR_M, ModelSlices
 from poise.sim.make import make_backend
 from poise.sim.scene import Scene, alone
 from poise.sim.worlds import check_state, row_index
@@ -94,7 +94,7 @@ class CharacterRows:
     def __init__(
         self,
         world: Backend,
-        places: Sequence[Place],
+        places: Sequence[ModelSlices],
         model: mujoco.MjModel,
         sim: SceneSim | None = None,
         sole: bool = False,
@@ -279,7 +279,7 @@ class Contact(NamedTuple):
     point: Tensor
 
 
-class Pull(NamedTuple):
+class LinkForce(NamedTuple):
     """What a measured `Link` exerted on its body `b`, in the last physics step; 0 while it is off.
 
     Attributes:
@@ -417,7 +417,7 @@ class SceneSim:
             self.link_data[to, i] = data.to(self.link_data)
         state["eq_active"][to, i] = on
 
-    def link(self, name: str) -> Pull:
+    def link(self, name: str) -> LinkForce:
         """What a measured link exerts."""
         links = {link.name: link for link in self.scene.scene.links}
         if name not in links:
@@ -442,7 +442,7 @@ class SceneSim:
         seen = [int(model.sensor(f"{link.hook} {kind}").adr[0]) for kind in ("force", "torque")]
         turn, data = state.xquat[:, body], state["sensordata"]
         force, torque = (sign * quat_rotate(turn, data[:, at : at + 3].to(turn)) for at in seen)
-        return Pull(force, torque, state["site_xpos"][:, site])
+        return LinkForce(force, torque, state["site_xpos"][:, site])
 
     def touch(self, name: str) -> Contact:
         """What is measured of a touch."""

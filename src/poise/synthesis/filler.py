@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.kinematics.retarget.passage import Passage
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.passage import Retargeter
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.learn.between import Between
 from poise.learn.inbetween import Adaptation, InbetweenModel, adapt
-from poise.learn.transition import Filled, Known
-from poise.learn.transition import Filled as Transition
+from poise.learn.transition import FilledGap, Known
+from poise.learn.transition import FilledGap as Transition
 from poise.motion.clip import Clip
 from poise.motion.roles import map_joints
 from poise.motion.rotations import (
@@ -114,8 +114,8 @@ class OtherRig:
 
     clip: Clip
     example: Clip
-    there: Passage
-    back: Passage
+    there: Retargeter
+    back: Retargeter
 
     @staticmethod
     def between(clip: Clip, example: Clip) -> OtherRig:
@@ -124,9 +124,9 @@ class OtherRig:
         Raises:
             PoiseError: a skeleton without pelvis or legs.
         """
-        there = Passage.between(clip, example)
+        there = Retargeter.between(clip, example)
         joints = map_joints(example.skeleton, clip.skeleton)
-        back = Passage(joints, there.there, there.here, there.scale.inverse())
+        back = Retargeter(joints, there.there, there.here, there.scale.inverse())
         return OtherRig(clip, example, there, back)
 
     def to_model(self, path: Path) -> Path:
@@ -145,9 +145,9 @@ class OtherRig:
         return root, unwrap_quats(normalize(quat_mul(known[1], turn)))
 
     @staticmethod
-    def _passed(clip: Clip, passage: Passage, path: Path) -> Path:
+    def _passed(clip: Clip, passage: Retargeter, path: Path) -> Path:
         skeleton = clip.skeleton
-        world = World(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
+        world = ClipWorld(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
         rot, root = passage.transfer(world)
         return root, unwrap_quats(normalize(rot))
 
@@ -200,9 +200,9 @@ def drawn(length: int, fps: float, noise: torch.Generator) -> Detour | None:
 
 
 def through(
-    net: Between, root: Tensor, rot: Tensor, seen: Tensor, offsets: Tensor, guess: Filled,
+    net: Between, root: Tensor, rot: Tensor, seen: Tensor, offsets: Tensor, guess: FilledGap,
     detour: Detour, noise: torch.Generator,
-) -> Filled:  # fmt: skip
+) -> FilledGap:  # fmt: skip
     """The frames of one window `(1, T, ...)` again, led through a detour of the best guess.
 
     Args:

@@ -13,7 +13,7 @@ from torch import Tensor
 from poise.body import find_anatomy
 from poise.errors import PoiseError
 from poise.kinematics.feet import Sole
-from poise.kinematics.hold import FIRM, Lead, Standing, hold, led
+from poise.kinematics.hold import FIRM, Lead, StandingFoot, hold, led
 from poise.kinematics.limbs import limb_of, match_positions
 from poise.motion import Skeleton
 from poise.motion.rotations import (
@@ -48,7 +48,7 @@ class Ends(NamedTuple):
     level_quat: Tensor
 
 
-class Way(NamedTuple):
+class FootPath(NamedTuple):
     """Ankle `(T, 3)` m and rotation `(T, 4)` of a foot, and that which it had if no heel rose."""
 
     ankle: Tensor
@@ -79,7 +79,7 @@ def ends_of(
 
 def path_of(
     t: Tensor, k: int, swings: Sequence[Swing], ends: Ends, sole: Tensor, leaves: Tensor | None
-) -> Way:
+) -> FootPath:
     """The path of one foot; toes are at `sole (3,)` m in its own frame, which leave at `leaves` m/s."""
     n, seconds = len(swings), float(t[-1])
     up = bool(ends.up[0, k]), bool(ends.up[1, k])
@@ -125,7 +125,7 @@ def path_of(
         flat = torch.where(later, even, flat)
     tip, flat = _from_and_to(t, k, swings, up, ends, tip, flat)
     turn = _from_and_to(t, k, swings, up, ends, tip, turn)[1]
-    return Way(tip - quat_rotate(turn, sole.expand_as(tip)), turn, flat)
+    return FootPath(tip - quat_rotate(turn, sole.expand_as(tip)), turn, flat)
 
 
 def _from_and_to(
@@ -204,7 +204,7 @@ def stepped(
         past_toes = [(pos[0, toes[a]] - was[toes[a]]) * fps for a in ankles]
     t = torch.arange(len(root), dtype=rot.dtype) / fps
     tried: set[tuple[Swing, ...]] = set()
-    ways_to_go: list[tuple[float, list[Way]]] = []
+    ways_to_go: list[tuple[float, list[FootPath]]] = []
     for first, *more in product((0, 1), (0, 1), (0, 1)):
         plan = planned(ways, ends.up, seconds, first, (more[0], more[1]))
         if plan is None or plan in tried:
@@ -230,7 +230,7 @@ def stepped(
 
 def _walked(
     skeleton: Skeleton, motion: Motion, pos: Tensor, quat: Tensor, ankles: Sequence[int],
-    toes: Mapping[int, int], paths: Sequence[Way], fps: float,
+    toes: Mapping[int, int], paths: Sequence[FootPath], fps: float,
 ) -> Motion:  # fmt: skip
     """The motion with its feet on their paths."""
     root, rot = motion[0], motion[1].clone()
@@ -248,7 +248,7 @@ def _walked(
 
 
 def _cost(
-    skeleton: Skeleton, pos: Tensor, ankles: Sequence[int], paths: Sequence[Way], fps: float
+    skeleton: Skeleton, pos: Tensor, ankles: Sequence[int], paths: Sequence[FootPath], fps: float
 ) -> float:
     """How hard a plan is: by how much legs are too short for it, and feet faster than `FAST`."""
     worst = 0.0
@@ -320,9 +320,11 @@ def lock_feet(
         contact[gap] = stepping(contact[gap], steps, [s.columns for s in soles])
     bears = (contact[1:] & contact[:-1]).to(rot.dtype) * FIRM
 
-    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
+    def standing(pos: Tensor, _: Tensor) -> dict[int, StandingFoot]:
         return {
-            s.ankle: Standing(Sole(pos[:, s.ankle], pos[:, [s.ankle, s.toe]]), bears[:, list(s.columns)])
+            s.ankle: StandingFoot(
+                Sole(pos[:, s.ankle], pos[:, [s.ankle, s.toe]]), bears[:, list(s.columns)]
+            )
             for s in soles
             if bool(bears[:, list(s.columns)].any())
         }

@@ -45,7 +45,7 @@ _SAME_RIG = 0.94
 
 
 @dataclass(frozen=True, eq=False)
-class Filled:
+class FilledClips:
     """The clips, and what the user should know.
 
     over: by which factor the fastest joint goes beyond what people reach in each gap between keyframes
@@ -65,7 +65,7 @@ def fill_keyframes(
     model: InbetweenModel,
     filling: Filling | None = None,
     on_gap: Callable[[int, int], None] | None = None,
-) -> Filled:
+) -> FilledClips:
     """The clip with everything between its keyframes made anew; all other frames stay as they are.
 
     Frames before the first keyframe are what the network sees of the past, frames after the last one
@@ -131,7 +131,7 @@ def fill_keyframes(
         max((c.over for (x, y), c in filler.calmed.items() if a <= x and y <= b), default=0.0)
         for a, b in pairwise(keys)
     )
-    return Filled(tuple(clips), (*warnings, *_calmings(filler.calmed)), gaps_over, tuple(faults))
+    return FilledClips(tuple(clips), (*warnings, *_calmings(filler.calmed)), gaps_over, tuple(faults))
 
 
 def _counted(on_gap: Callable[[int, int], None], before: int, of: int, made: int) -> None:

@@ -30,7 +30,7 @@ _MOST_OF_GAP, _EDGE_FRAMES = 0.45, 2
 _MIDDLE = 0.6
 
 
-class Step(NamedTuple):
+class FootStep(NamedTuple):
     """A foot swings in the frames `start` to `stop` (exclusive)."""
 
     foot: int
@@ -38,7 +38,7 @@ class Step(NamedTuple):
     stop: int
 
 
-def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[Step, ...]:
+def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[FootStep, ...]:
     """The steps that must be taken for feet to stand where both ends of a gap have them.
 
     Args:
@@ -53,7 +53,7 @@ def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[Step, ...]
     apart = (soles[-1, ..., :2] - soles[0, ..., :2]).norm(dim=-1).amin(-1)
     wanting = [k for k in range(feet) if bool(stands[:, k].all()) and apart[k] > LEAST_M]
     stands = stands.clone()
-    found: list[Step] = []
+    found: list[FootStep] = []
     for k in sorted(wanting, key=lambda k: _moved(ankles[:, k])):
         seconds = SWING_S + SWING_S_PER_M * float(apart[k])
         length = round(min(seconds * fps, _MOST_OF_GAP * frames))
@@ -62,12 +62,12 @@ def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[Step, ...]
         others = [j for j in range(feet) if j != k]
         later = len(wanting) - len(found) - 1
         start = _when(_moved(ankles[:, k]), ~stands[:, others].all(1), length, later)
-        found.append(Step(k, start, start + length))
+        found.append(FootStep(k, start, start + length))
         stands[start : start + length, k] = False
     return tuple(found)
 
 
-def stepping(stands: Tensor, steps: Sequence[Step], columns: Sequence[Sequence[int]]) -> Tensor:
+def stepping(stands: Tensor, steps: Sequence[FootStep], columns: Sequence[Sequence[int]]) -> Tensor:
     """Contacts `(T, F)` with the feet of `steps` off the floor; columns: those of every foot."""
     stands = stands.clone()
     for step in steps:

@@ -13,7 +13,7 @@ from poise.formats import read_clip
 from poise.kinematics import anatomy_of, hold_feet, lowest_height
 from poise.kinematics import hold as feet_hold
 from poise.kinematics.hold import led
-from poise.kinematics.repair.support import Support
+from poise.kinematics.repair.support import FloorPoints
 from poise.metrics import foot_slide
 from poise.motion import Clip
 
@@ -32,7 +32,7 @@ def table(walk: Clip) -> BodyTable:
 
 def slide(clip: Clip, table: BodyTable) -> float:
     """mm/s of the soles."""
-    return float(foot_slide(Support.of(clip, anatomy_of(clip), table).soles, clip.fps))
+    return float(foot_slide(FloorPoints.of(clip, anatomy_of(clip), table).soles, clip.fps))
 
 
 def standing(walk: Clip, table: BodyTable, frames: int = 60) -> Clip:

@@ -16,7 +16,7 @@ from poise.kinematics.feet import rest_height
 from poise.kinematics.limbs import match_positions
 from poise.kinematics.retarget.common_pose import common_pose
 from poise.kinematics.retarget.plant import BLEND_S, contact_weight
-from poise.kinematics.retarget.standing import World, hinge_axis
+from poise.kinematics.retarget.standing import ClipWorld, hinge_axis
 from poise.motion import Clip, Skeleton, find_roles, resample, trim
 from poise.motion.rotations import (
     euler_to_quat,
@@ -380,13 +380,13 @@ def test_a_hinge_is_seen_only_where_a_limb_bends() -> None:
     clip = walk()
     limb = tuple(clip.skeleton.index(f"Left{x}") for x in ("Arm", "ForeArm", "Hand"))
     assert len(limb) == 3
-    axis = hinge_axis(World.of(clip), limb)
+    axis = hinge_axis(ClipWorld.of(clip), limb)
     # The toy's elbow turns by negative angles about its y, arms hanging.
     assert axis is not None
     np.testing.assert_allclose(axis.numpy(), (0, -1, 0), atol=1e-9)
     still = np.array(clip.rot)
     still[:, limb[1]] = (1, 0, 0, 0)
-    assert hinge_axis(World.of(clip.replaced(rot=still)), limb) is None
+    assert hinge_axis(ClipWorld.of(clip.replaced(rot=still)), limb) is None
 
 
 def test_contact_weights_rise_and_fall_smoothly() -> None:

@@ -14,7 +14,15 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.play import WORDS, play
-from poise.papers.compliant.scenes import Balance, Chicken, Doorway, Hands, Pull, Throws, Trampoline
+from poise.papers.compliant.scenes import (
+    Balance,
+    Chicken,
+    DoorScene,
+    HandInHand,
+    PullScene,
+    Throws,
+    TrampolineScene,
+)
 from poise.papers.compliant.watch import footfalls
 from refusals import refused
 from toy_policy import WALK
@@ -26,7 +34,7 @@ def tracker() -> Tracker:
 
 
 def test_hand_in_hand_it_gives_way(tracker: Tracker, tmp_path: Path) -> None:
-    made = play(Hands(), tracker, read_clip(WALK), Stiffness(500.0, 0.5), count=4, threads=1)
+    made = play(HandInHand(), tracker, read_clip(WALK), Stiffness(500.0, 0.5), count=4, threads=1)
     a, b = made.figures, made.stiff
     assert set(a) == set(b) == set(WORDS)
     assert a["force_mean_n"] < 0.7 * b["force_mean_n"] and a["lost"] < b["lost"]
@@ -47,7 +55,9 @@ def test_hand_in_hand_it_gives_way(tracker: Tracker, tmp_path: Path) -> None:
 
 
 def test_a_pull_and_throws_are_seen(tracker: Tracker) -> None:
-    pulled = play(Pull(15.0, start_s=0.2), tracker, None, Stiffness(200.0), 2, seconds=1.0, threads=1)
+    pulled = play(
+        PullScene(15.0, start_s=0.2), tracker, None, Stiffness(200.0), 2, seconds=1.0, threads=1
+    )
     for figures in (pulled.figures, pulled.stiff):
         assert figures["force_mean_n"] == pytest.approx(15.0) and figures["lost"] == 0
     assert pulled.figures["goal_moved_m"] > pulled.stiff["goal_moved_m"] == 0.0
@@ -59,7 +69,7 @@ def test_a_pull_and_throws_are_seen(tracker: Tracker) -> None:
 
 
 def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:
-    made = play(Doorway(1.0), tracker, None, Stiffness(500.0, 0.5), 2, threads=1, name="door")
+    made = play(DoorScene(1.0), tracker, None, Stiffness(500.0, 0.5), 2, threads=1, name="door")
     for figures in (made.figures, made.stiff):
         assert set(figures) == set(made.words) and len(figures) == len(WORDS) + 4
         assert figures["opened"] == 2.0 and figures["lost"] == 0.0 and figures["angle_rad"] > 0.7
@@ -67,12 +77,12 @@ def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:
     page = made.write(tmp_path / "out")["report"].read_text()
     assert "<title>door, opening" in page and len(made.movers) == 3
     with refused("settings-conflict"):
-        play(Doorway(1.0), tracker, read_clip(WALK), count=2, threads=1)
+        play(DoorScene(1.0), tracker, read_clip(WALK), count=2, threads=1)
 
 
 def test_a_wide_door_takes_a_motion_of_its_own(tracker: Tracker) -> None:
     wide, paper = (
-        play(Doorway(1.7, made_for=m), tracker, None, Stiffness(500.0, 0.5), 2, threads=1)
+        play(DoorScene(1.7, made_for=m), tracker, None, Stiffness(500.0, 0.5), 2, threads=1)
         for m in (None, 1.0)
     )
     assert wide.figures["opened"] == 2.0 and wide.figures["lost"] == 0.0
@@ -80,7 +90,7 @@ def test_a_wide_door_takes_a_motion_of_its_own(tracker: Tracker) -> None:
 
 
 def test_on_a_trampoline(tracker: Tracker) -> None:
-    made = play(Trampoline(0.1), tracker, None, None, 2, seconds=2.2, threads=1, name="trampoline")
+    made = play(TrampolineScene(0.1), tracker, None, None, 2, seconds=2.2, threads=1, name="trampoline")
     assert set(made.figures) == set(made.words) and len(made.movers) == 1
     for figures in (made.figures, made.stiff):
         assert figures["plate_m"] > 0.05 and figures["force_peak_n"] > 300.0
@@ -91,7 +101,7 @@ def test_on_a_trampoline(tracker: Tracker) -> None:
 
 
 def test_lookahead_tries_in_copies_of_the_scene(tracker: Tracker) -> None:
-    scene, tight = Trampoline(0.1, first=0.2), {"count": 1, "seconds": 0.6, "threads": 1}
+    scene, tight = TrampolineScene(0.1, first=0.2), {"count": 1, "seconds": 0.6, "threads": 1}
     alone, ahead, again = (
         play(scene, tracker, None, None, controller=c, **tight)  # type: ignore[arg-type]
         for c in ("policy", "lookahead", "lookahead")

@@ -22,12 +22,12 @@ from poise.jobs.track.placement import place
 from poise.papers.compliant.scenes import (
     SCENES,
     Balance,
-    Doorway,
-    Hands,
+    DoorScene,
+    HandInHand,
     PlayScene,
-    Pull,
+    PullScene,
     Throws,
-    Trampoline,
+    TrampolineScene,
     ball,
     door,
 )
@@ -46,7 +46,7 @@ def task() -> Imitation:
 
 
 def test_a_partner_goes_as_the_motion_goes(task: Imitation) -> None:
-    stage = Hands(lead=0.2, sway=0.1).stage(task.humanoid, task.reference)
+    stage = HandInHand(lead=0.2, sway=0.1).stage(task.humanoid, task.reference)
     (prop,), (link,), (part,) = stage.props, stage.links, stage.plugins
     assert isinstance(part, InScene) and part.felt == (link.name,)
     assert (link.a, link.b) == (prop.name, "lwrist")
@@ -65,7 +65,7 @@ def test_a_partner_goes_as_the_motion_goes(task: Imitation) -> None:
 
 
 def test_a_pull_and_throws(task: Imitation) -> None:
-    (push,) = Pull(30.0, "right", (0.0, 0.0, -2.0)).stage(task.humanoid, task.reference).plugins
+    (push,) = PullScene(30.0, "right", (0.0, 0.0, -2.0)).stage(task.humanoid, task.reference).plugins
     assert isinstance(push, Push) and push.force == (0.0, 0.0, -30.0) and push.first == 15
     assert task.humanoid.bodies[push.row] == "rwrist"
     stage = Throws(mass=2.0).stage(task.humanoid, task.reference)
@@ -77,7 +77,7 @@ def test_a_pull_and_throws(task: Imitation) -> None:
 def test_doors_of_all_widths_have_their_knob_at_the_hand(task: Imitation) -> None:
     knobs: list[Tensor] = []
     for width in (1.0, 1.7):
-        stage = Doorway(width).stage(task.humanoid, task.reference)
+        stage = DoorScene(width).stage(task.humanoid, task.reference)
         (leaf,) = stage.props
         assert isinstance(leaf, Door) and leaf.width == width
         knobs.append(torch.tensor(leaf.pos) + torch.tensor(leaf.knob))
@@ -90,7 +90,7 @@ def test_doors_of_all_widths_have_their_knob_at_the_hand(task: Imitation) -> Non
 
 
 def test_what_a_door_s_knob_does_and_what_the_task_pays(task: Imitation) -> None:
-    stage = Doorway(1.0).stage(task.humanoid, task.reference)
+    stage = DoorScene(1.0).stage(task.humanoid, task.reference)
     things = (Character(task.humanoid), *stage.props)
     sim = SceneSim(Scene(things, stage.links, sim=task.config.sim), 2, threads=1)
     sim.place("door", torch.tensor([[0.0], [-0.7]]), torch.zeros(2, 1))
@@ -111,7 +111,7 @@ def test_what_a_door_s_knob_does_and_what_the_task_pays(task: Imitation) -> None
 
 
 def test_a_hand_that_keeps_away_from_the_knob_ends_the_episode(task: Imitation) -> None:
-    stage = Doorway(1.0).stage(task.humanoid, task.reference)
+    stage = DoorScene(1.0).stage(task.humanoid, task.reference)
     (end,) = stage.dones
     away = torch.tensor([0.0, 0.3, 0.3, 0.3])
 
@@ -137,11 +137,11 @@ def test_a_door_that_nobody_gets_through(task: Imitation) -> None:
     broad = door.breadth(task.humanoid, task.reference)
     assert 0.25 < broad < 0.6
     with refused("too-narrow", says="0.2"):
-        Doorway(0.2).stage(task.humanoid, task.reference)
+        DoorScene(0.2).stage(task.humanoid, task.reference)
 
 
 def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> None:
-    stage = Trampoline(0.1).stage(task.humanoid, task.reference)
+    stage = TrampolineScene(0.1).stage(task.humanoid, task.reference)
     (plate,), (part,) = stage.props, stage.plugins
     # Under the middle of what the motion crosses.
     way = task.reference.pose.pos[:, 0, :2]
@@ -246,7 +246,7 @@ def test_what_balancing_sees_and_is_paid() -> None:
     torch.testing.assert_close(seen, torch.tensor(expected), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("scene", [Hands(), Pull(), Doorway()])
+@pytest.mark.parametrize("scene", [HandInHand(), PullScene(), DoorScene()])
 def test_a_skeleton_without_hands(task: Imitation, scene: PlayScene) -> None:
     table = task.humanoid.table
     rows = tuple(replace(r, kind="forearm" if r.kind == "hand" else r.kind) for r in table.rows)
@@ -266,15 +266,15 @@ def test_a_skeleton_without_a_head(task: Imitation) -> None:
 @pytest.mark.parametrize(
     ("made", "what"),
     [
-        (lambda: Pull(0.0), "pull: newtons must be above 0"),
-        (lambda: Pull(direction=(0.0, 0.0, 0.0)), "a pull needs a direction"),
-        (lambda: Pull(lasts_s=0.0), "lasts_s must be above 0"),
-        (lambda: Hands(sway=2.0), "sway must be at least 0 and below 1 m"),
-        (lambda: Doorway(0.0), "width must be above 0 and below 10 m"),
-        (lambda: Doorway(made_for=9.0), "made_for must lie in 0.5 to 3 m"),
+        (lambda: PullScene(0.0), "pull: newtons must be above 0"),
+        (lambda: PullScene(direction=(0.0, 0.0, 0.0)), "a pull needs a direction"),
+        (lambda: PullScene(lasts_s=0.0), "lasts_s must be above 0"),
+        (lambda: HandInHand(sway=2.0), "sway must be at least 0 and below 1 m"),
+        (lambda: DoorScene(0.0), "width must be above 0 and below 10 m"),
+        (lambda: DoorScene(made_for=9.0), "made_for must lie in 0.5 to 3 m"),
         (lambda: Throws(mass=0.0), "mass must be above 0 and below 100 kg"),
-        (lambda: Trampoline(2.0), "height must lie in 0 to 1 m"),
-        (lambda: Trampoline(first=3.0), "first must be at least 0 and below 3 s"),
+        (lambda: TrampolineScene(2.0), "height must lie in 0 to 1 m"),
+        (lambda: TrampolineScene(first=3.0), "first must be at least 0 and below 3 s"),
         (lambda: Balance(length=0.0), "length must lie in 0.1 to 5 m"),
         (lambda: Balance(pushes=-1.0), "pushes must be at least 0"),
     ],

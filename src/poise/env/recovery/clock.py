@@ -13,7 +13,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.control import PDTargets
 from poise.env import frame as observables
-from poise.env.frame import Frame, Layout, LazyPose, Observable, PointGoal, Pose
+from poise.env.frame import Frame, LazyPose, Observable, PointGoal, Pose, PoseLayout
 from poise.env.plugins import Plugin
 from poise.env.recovery.falls import Drop, fall_states, rest_angles
 from poise.env.reference import Start
@@ -165,7 +165,7 @@ class RecoveryClock(Plugin):
         backend: Backend,
         humanoid: Humanoid,
         pd: PDTargets,
-        layout: Layout,
+        layout: PoseLayout,
         seed: int = 0,
     ):
         self.config, self.seed, self._layout = config, seed, layout

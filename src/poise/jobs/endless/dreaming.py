@@ -18,7 +18,15 @@ from torch import Tensor
 from poise.env import Acts, ImitationEnv
 from poise.env.generator import EndlessGoal, Steering
 from poise.errors import PoiseError
-from poise.jobs.endless.dreamt import Body, Character, Dream, Dreamt, FrameStore, MotionWriter, Pieces
+from poise.jobs.endless.dreamt import (
+    ClipMaker,
+    Dream,
+    Dreamt,
+    DreamtCharacter,
+    FrameStore,
+    MotionWriter,
+    Pieces,
+)
 from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.controllers import NO_CRITIC, look_ahead
@@ -88,9 +96,9 @@ def dream(
     if config.controller == "lookahead" and tracker.value is None:
         notes.append(NO_CRITIC)
     pasts = begun(made, config, None if seed_clip is None else past_of(seed_clip, made, tracker))
-    body = Body(tracker.humanoid.table, tracker.example, rate)
+    body = ClipMaker(tracker.humanoid.table, tracker.example, rate)
     characters = [
-        Character(FrameStore(7 + len(model.hinges)), FrameStore(7 + len(model.hinges)))
+        DreamtCharacter(FrameStore(7 + len(model.hinges)), FrameStore(7 + len(model.hinges)))
         for _ in range(config.count)
     ]
     writers = [
@@ -220,7 +228,9 @@ class _Seen:
     goal: EndlessGoal
     stopped: Callable[[], bool]
 
-    def __init__(self, characters: list[Character], pieces: list[Pieces], steps: int, show: Show | None):
+    def __init__(
+        self, characters: list[DreamtCharacter], pieces: list[Pieces], steps: int, show: Show | None
+    ):
         self.characters, self.pieces, self.steps, self.show = characters, pieces, steps, show
         self._all = torch.arange(len(characters))
 

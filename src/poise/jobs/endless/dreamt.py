@@ -23,7 +23,7 @@ from poise.env.generator import Steering
 from poise.errors import PoiseError
 from poise.formats import check_writable, home_suffix, write_clip
 from poise.formats.text import write_whole
-from poise.jobs.result import Result, Shown
+from poise.jobs.result import Result, ResultView
 from poise.jobs.tracker import Tracker
 from poise.kinematics import hold_feet, lowest_height, qpos_to_clip
 from poise.kinematics.forward import Kinematics, shapes_of
@@ -154,7 +154,7 @@ class FrameStore:
         return np.frombuffer(data, np.float32).reshape(-1, self.width).astype(np.float64)
 
 
-class Body:
+class ClipMaker:
     """Turns coordinates into clips on a body's skeleton; joints without hinges stay as in `example`."""
 
     def __init__(self, table: BodyTable, example: Clip, fps: float):
@@ -182,7 +182,12 @@ class Pieces:
     """
 
     def __init__(
-        self, store: FrameStore, body: Body, give: Callable[[Clip], None], name: str, hold: bool = True
+        self,
+        store: FrameStore,
+        body: ClipMaker,
+        give: Callable[[Clip], None],
+        name: str,
+        hold: bool = True,
     ):
         self.store, self.body, self.give, self.name, self.hold = store, body, give, name, hold
         self._given = 0
@@ -231,7 +236,7 @@ def _part(clip: Clip, first: int, last: int) -> Clip:
 SHOWN_S = 60.0
 
 
-class Character(NamedTuple):
+class DreamtCharacter(NamedTuple):
     """One character's frames: as it was simulated, and what the kinematic policy asked for."""
 
     done: FrameStore
@@ -253,8 +258,8 @@ class Dreamt(Result):
     """
 
     tracker: Tracker
-    body: Body
-    characters: tuple[Character, ...]
+    body: ClipMaker
+    characters: tuple[DreamtCharacter, ...]
     lost: tuple[tuple[int, float], ...]
     back: tuple[tuple[int, float], ...]
     reached: tuple[tuple[int, float], ...]
@@ -401,8 +406,8 @@ class Dreamt(Result):
             others=tuple(track(c.done, f"character {k}") for k, c in enumerate(others, 2)),
         )  # fmt: skip
 
-    def _shown(self) -> Shown:
-        return Shown(self.clip, self.asked, None, (self.sentence, *self.notes))
+    def _shown(self) -> ResultView:
+        return ResultView(self.clip, self.asked, None, (self.sentence, *self.notes))
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         paths: dict[str, Path] = {}

@@ -15,7 +15,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, load_module, prefixed, save_checkpoint, take
-from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, Frames, make_cvae
+from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, PackedFrames, make_cvae
 from poise.settings import from_data
 from poise.synthesis.generator import ROOT, Codes, Kinematic
 
@@ -36,7 +36,7 @@ class _Needed(TypedDict):
     about: dict[str, Any]
 
 
-class _Meta(_Needed, total=False):
+class _GeneratorMeta(_Needed, total=False):
     labels: list[str]
 
 
@@ -129,7 +129,7 @@ def load_generator(path: str | Path | None = None) -> GeneratorModel:
     """
     file = SHIPPED if path is None else Path(path)
     file = file / GENERATOR if file.is_dir() else file
-    tensors, meta = load_checkpoint(file, _Meta)
+    tensors, meta = load_checkpoint(file, _GeneratorMeta)
     if meta["kind"] != "kinematic policy":
         raise PoiseError("the file holds no kinematic policy", file, code="wrong-file-kind")
     config = from_data(CVAEConfig, meta["config"], file)
@@ -255,7 +255,7 @@ class Motions:
         clips: names.
     """
 
-    frames: Frames
+    frames: PackedFrames
     seeds: Tensor
     bounds: Tensor
     reach: Tensor

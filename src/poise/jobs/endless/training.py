@@ -31,7 +31,15 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.kinematics.forward import Kinematics
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint, take
-from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, CVAEObjective, CVAETraining, Frames, make_cvae
+from poise.learn.cvae import (
+    CVAE,
+    CosineCVAE,
+    CVAEConfig,
+    CVAEObjective,
+    CVAETraining,
+    PackedFrames,
+    make_cvae,
+)
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
 from poise.motion import ClipLibrary
 from poise.settings import Checked, Share, from_data, to_data
@@ -104,7 +112,7 @@ def motions_of(
     bounds = torch.stack((angles.amin(0), angles.amax(0)))
     frames = torch.cat(parts)
     return Motions(
-        Frames(frames, first), torch.stack([pasts[i] for i in picks.tolist()]), bounds,
+        PackedFrames(frames, first), torch.stack([pasts[i] for i in picks.tolist()]), bounds,
         reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate,
         tuple(c.name for c in library),
     )  # fmt: skip
@@ -190,7 +198,7 @@ def balanced(motions: Motions, kinds: Tensor, config: Endless) -> Motions:
     windows = torch.bincount(frames.clip[frames.room >= window], minlength=len(kinds)).double()
     many = torch.zeros(int(kinds.max()) + 2).double().index_add(0, kinds + 1, windows)
     weights = many.clamp_min(1.0).pow(-config.balance)[kinds + 1]
-    return replace(motions, frames=Frames(frames.frames, frames.first, weights))
+    return replace(motions, frames=PackedFrames(frames.frames, frames.first, weights))
 
 
 def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
@@ -230,7 +238,7 @@ RUN_FILE = "motions.safetensors"
 TRIALS = 8
 
 
-class _Meta(TypedDict):
+class _TrainingMeta(TypedDict):
     kind: str
     config: dict[str, Any]
     library: list[str]
@@ -279,7 +287,7 @@ def begin(
     )
     if minutes is not None:
         config = from_data(Endless, to_data(config) | {"steps": steps_in(motions, config, minutes)}, run)
-    meta: _Meta = {
+    meta: _TrainingMeta = {
         "kind": "endless run", "config": to_data(config), "library": said,
         "hinges": list(motions.hinges), "fps": motions.fps, "clips": list(motions.clips),
     }  # fmt: skip
@@ -297,14 +305,14 @@ def opened(run: Path) -> tuple[Motions, Endless, list[str]]:
     Raises:
         PoiseError: the file is damaged or of another kind.
     """
-    tensors, meta = load_checkpoint(run, _Meta)
+    tensors, meta = load_checkpoint(run, _TrainingMeta)
     if meta["kind"] != "endless run":
         raise PoiseError("the file is no training of a kinematic policy", run, code="wrong-file-kind")
     frames, first, seeds, bounds, reach = (
         take(tensors, k) for k in ("frames", "first", "seeds", "bounds", "reach")
     )
     motions = Motions(
-        Frames(frames, first), seeds, bounds, reach, tuple(meta["hinges"]), float(meta["fps"]),
+        PackedFrames(frames, first), seeds, bounds, reach, tuple(meta["hinges"]), float(meta["fps"]),
         tuple(meta["clips"]),
     )  # fmt: skip
     return motions, from_data(Endless, meta["config"], run), meta["library"]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 from poise.formats import home_suffix, write_clip
-from poise.jobs.result import Result, Shown, clip_of
+from poise.jobs.result import Result, ResultView, clip_of
 from poise.learn.inbetween import MODEL, InbetweenModel, load_model
 from poise.motion import Clip
 from poise.synthesis.filler import EACH_GAP, Filling, check_keyframes
@@ -48,8 +48,8 @@ class Inbetweened(Result):
         """The best guess."""
         return self.clips[0]
 
-    def _shown(self) -> Shown:
-        return Shown(self.clip, self.source, None, self.notes, self.keyframes)
+    def _shown(self) -> ResultView:
+        return ResultView(self.clip, self.source, None, self.notes, self.keyframes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         paths: dict[str, Path] = {}

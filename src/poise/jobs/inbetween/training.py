@@ -42,7 +42,7 @@ from poise.learn.inbetween import (
     train_inbetween,
 )
 from poise.learn.rtn import RTN, RTNObjective
-from poise.learn.transition import Layout
+from poise.learn.transition import SkeletonLayout
 from poise.learn.windows import FrameData, Sampler
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import normalize
@@ -193,7 +193,7 @@ def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> 
     train = protocol.split(bank, "train")
     # What never moves in a library has no deviation to divide by.
     std = deviation(train, protocol).clamp_min(1e-3)
-    layout = Layout(bank.parents, bank.feet, bank.facing)
+    layout = SkeletonLayout(bank.parents, bank.feet, bank.facing)
     if config.mirror:
         train = joined(train, mirrored(train))
     data = frame_data(train, layout, std, config.contacts)
@@ -203,7 +203,7 @@ def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> 
     return Task(config, bank, data, held, notes)
 
 
-def frame_data(bank: FrameBank, layout: Layout, std: torch.Tensor, rule: Contacts) -> FrameData:
+def frame_data(bank: FrameBank, layout: SkeletonLayout, std: torch.Tensor, rule: Contacts) -> FrameData:
     """A bank as float32 tensors with contact labels per clip."""
     points = bank.positions()[:, list(bank.feet)]
     parts = cast("tuple[torch.Tensor, ...]", points.split(torch.diff(bank.first).tolist()))

@@ -213,7 +213,7 @@ class Target:
         )
 
 
-class Taken(NamedTuple):
+class LibraryClip(NamedTuple):
     """A clip that was read and cleaned, at the library's rate, with its file and repairs, and the doubt
     about the file's own rate in words. obeyed: the rate is one that the user stated."""
 
@@ -226,13 +226,13 @@ class Taken(NamedTuple):
 
 def read_all(
     files: Sequence[MotionFile], fps: float, config: LibraryConfig, tell: Callable[[str], None]
-) -> tuple[list[Taken], dict[str, ClipNote]]:
+) -> tuple[list[LibraryClip], dict[str, ClipNote]]:
     """Every clip that can be read and is long enough, and by name a note on each of the others.
 
     Raises:
         PoiseError: no file can be used.
     """
-    read: list[Taken] = []
+    read: list[LibraryClip] = []
     notes: dict[str, ClipNote] = {}
     for k, file in enumerate(files, 1):
         got = _read(file, fps, config)
@@ -250,7 +250,7 @@ def read_all(
     return read, notes
 
 
-def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNote:
+def _read(file: MotionFile, fps: float, config: LibraryConfig) -> LibraryClip | ClipNote:
     note = ClipNote(file.name, file.subject, str(file.path), "left out")
     if matches(config.leave_out, file.name, file.subject):
         return replace(note, rule="by hand", reason="it was to be left out")
@@ -284,7 +284,7 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
         return replace(note, rule="word", reason=f"its name says '{word}'")
     said = [] if travel is None else [f"It {travel.words()}, and was given that travel."]
     doubt, obeyed = judge_rate(clip).sentence(), _stated(config.rates, file.name) is not None
-    return Taken(file, resampled, (*said, *report.sentences()), doubt, obeyed)
+    return LibraryClip(file, resampled, (*said, *report.sentences()), doubt, obeyed)
 
 
 def _stated(pairs: Sequence[tuple[str, _T]], name: str) -> _T | None:
@@ -346,7 +346,7 @@ def _most_common(clips: Sequence[Clip], body: BodyConfig) -> Target:
 
 
 def place(
-    taken: Taken, example: Clip, target: Target, config: LibraryConfig
+    taken: LibraryClip, example: Clip, target: Target, config: LibraryConfig
 ) -> tuple[Clip | None, ClipNote]:
     """A clip on the target and on the floor, without what no humanoid can do alone; and its note.
 

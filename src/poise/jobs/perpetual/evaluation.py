@@ -102,7 +102,7 @@ def _batch(
     return judge.results()
 
 
-class History:
+class EvaluationLog:
     """Every evaluation of every clip as a CSV file, after a resumed run as after an uninterrupted one.
 
     last: iterations after this one are dropped from an existing file.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.jobs.perpetual.evaluation import (
-    History,
+    EvaluationLog,
     StageRecord,
     back,
     check_falls,
@@ -65,7 +65,7 @@ from poise.sim import UnstableError
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class StageVerdict:
     """What an evaluation saw and says: every clip of the stage, trials of recovery, or both."""
 
     decision: Decision
@@ -101,7 +101,7 @@ class Judge:
         self,
         imitation: Imitation,
         stage_record: StageRecord,
-        history: History,
+        history: EvaluationLog,
         threads: int,
         device: str,
     ):
@@ -122,7 +122,7 @@ class Judge:
 
     def judge(
         self, stage: Stage, policy: PolicyBundle, scale: float | Tensor, over: bool, iteration: int
-    ) -> Judged:
+    ) -> StageVerdict:
         """Evaluates the stage's clips, or trials of recovery, and decides.
 
         A stage ends by what is done without help: where an evaluation with what is left of it finds that
@@ -145,14 +145,14 @@ class Judge:
             decision = "solved" if bool(clips.succeeded.all()) else "next"
         if card is not None and decision == "solved" and not self._enough(card):
             decision = "next"
-        return Judged(decision, clips, card)
+        return StageVerdict(decision, clips, card)
 
-    def _recovery(self, stage: Stage, policy: PolicyBundle, over: bool) -> Judged:
+    def _recovery(self, stage: Stage, policy: PolicyBundle, over: bool) -> StageVerdict:
         """Getting up is learned late and all at once, so that only success ends the stage, or time."""
         card = self.trials(stage, policy, self.config.recovering.trials)
         self.stage_record.record_trials(card, policy)
         ended: Decision = "solved" if self._enough(card) else "next"
-        return Judged(ended if over or ended == "solved" else "go on", None, card)
+        return StageVerdict(ended if over or ended == "solved" else "go on", None, card)
 
     def _both(
         self, stage: Stage, policy: PolicyBundle, scale: float | Tensor, iteration: int
@@ -226,7 +226,7 @@ class StageTrainer:
             self._enter(stage, start, warm, 1.0)
             # What the clone has cost is no time with help.
             self.begun = self.trainer.samples, self.trainer.seconds
-        self.history = History(folder, imitation.library.names, self.iteration)
+        self.history = EvaluationLog(folder, imitation.library.names, self.iteration)
         self.judge = Judge(imitation, self.stage_record, self.history, threads, device)
         self.log = Log(folder, self.iteration, tensorboard)
         self._saved_at, self._save_took = time.monotonic(), 0.0
@@ -364,7 +364,7 @@ class StageTrainer:
             left = (end - self.share) / (end - self.began)
             self.trainer.ppo.cool(left, cooling)
 
-    def _judge(self, over: bool) -> Judged:
+    def _judge(self, over: bool) -> StageVerdict:
         """Evaluates the present policy. over: the stage's time is."""
         judged = self.judge.judge(self.stage, self.trainer.policy(), self.helps, over, self.iteration)
         self._use_odds()
@@ -372,7 +372,7 @@ class StageTrainer:
 
     # --- stages -------------------------------------------------------------------------------
 
-    def _advance(self, judged: Judged) -> Stage | None:
+    def _advance(self, judged: StageVerdict) -> Stage | None:
         """Ends the stage; the next one, or None where there is none."""
         stage, stage_record, t = self.stage, self.stage_record, self.trainer
         member, policy = stage_record.mining.member.clone(), self.policy()

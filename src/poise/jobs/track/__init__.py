@@ -1,6 +1,6 @@
 """Tracking any motion with a trained policy: one simulated episode, nothing is trained."""
 
-from poise.jobs.track.controllers import Keeper, look_ahead
+from poise.jobs.track.controllers import ResetOnFail, look_ahead
 from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.tracked import Clean, Tracked, write
 from poise.jobs.track.tracking import (
@@ -11,7 +11,7 @@ from poise.jobs.track.tracking import (
 
 __all__ = [
     "Clean",
-    "Keeper",
+    "ResetOnFail",
     "TrackConfig",
     "Tracked",
     "imitation_of",

@@ -13,9 +13,9 @@ from torch import Tensor
 from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.track.placement import Placed
+from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
-from poise.jobs.track.recovering import Led, Replay, led_along, look_for, replay
+from poise.jobs.track.recovering import RecoveryRun, ReplayActions, led_along, look_for, replay
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.track.supports import crowd
 from poise.jobs.tracker import Tracker
@@ -24,7 +24,7 @@ from poise.plan import Lookahead, LookaheadConfig, SamplingConfig, SamplingResul
 from poise.recipes.imitation import Imitation
 from poise.score import ScoreCard, run_episodes, score_rollouts
 from poise.score.episodes import ContactForces, Recording
-from poise.score.rollouts import Judged, RolloutSet, judge
+from poise.score.rollouts import EpisodeOutcomes, RolloutSet, judge
 
 if TYPE_CHECKING:
     from poise.jobs.track.settings import TrackConfig
@@ -87,7 +87,7 @@ Show = Callable[[str, int, int], None]
 NO_CRITIC = "The policy was saved without its critic, which lookahead needs; it acts without."
 
 
-class Done(NamedTuple):
+class TrackingRun(NamedTuple):
     """How a motion was done.
 
     Attributes:
@@ -102,7 +102,7 @@ class Done(NamedTuple):
 
     rollouts: RolloutSet
     recordings: list[Recording]
-    judged: Judged
+    judged: EpisodeOutcomes
     failures: list[tuple[int, int]]
     controller: str
     found: SamplingResult | None = None
@@ -114,10 +114,10 @@ def done_by(
     tracker: Tracker,
     imitation: Imitation,
     config: TrackConfig,
-    replayed: Replay | None = None,
+    replayed: ReplayActions | None = None,
     show: Show | None = None,
     prices: Tensor | None = None,
-) -> tuple[Done, Sequence[str]]:
+) -> tuple[TrackingRun, Sequence[str]]:
     """Does a task's motion with the controller that is wanted, or whatever it takes.
 
     Args:
@@ -156,7 +156,12 @@ def done_by(
 
 
 def searched(
-    again: Done, earlier: Done, kept: Done, found: SamplingResult, config: SamplingConfig, rate_hz: float
+    again: TrackingRun,
+    earlier: TrackingRun,
+    kept: TrackingRun,
+    found: SamplingResult,
+    config: SamplingConfig,
+    rate_hz: float,
 ) -> str:
     """What a search came to, and what is kept of it.
 
@@ -177,11 +182,11 @@ def searched(
 
 def led_by(
     tracker: Tracker,
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedMotion],
     imitation: Imitation,
     config: TrackConfig,
     show: Show | None = None,
-) -> tuple[Led, Sequence[str]]:
+) -> tuple[RecoveryRun, Sequence[str]]:
     """Does motions one after another, see `led_along`, with lookahead where that is wanted.
 
     Returns:
@@ -236,7 +241,7 @@ def loses(tracker: Tracker, imitation: Imitation) -> bool:
 
 def episode(
     imitation: Imitation, config: TrackConfig, acts: Acts, controller: str, show: Show | None = None
-) -> Done:
+) -> TrackingRun:
     """One episode of all characters, each from its first frame."""
     count, task = config.count, imitation
     every = torch.arange(count)
@@ -244,9 +249,11 @@ def episode(
     env = task.env(1, None, False, 1, help_scale=0.0, backend=rows)
     if callable(watch := getattr(acts, "watch", None)):
         watch(env)
-    keeper = Keeper(env, acts) if config.reset_on_fail else None
+    keeper = ResetOnFail(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
-    told = [] if show is None else [Told("looking ahead", int(task.reference.length[0]) - 1, show)]
+    told = (
+        [] if show is None else [StepProgress("looking ahead", int(task.reference.length[0]) - 1, show)]
+    )
     # The report shows one character.
     touched, states = ContactForces(), States()
     push = None if config.push is None else PushSeen()
@@ -265,10 +272,10 @@ def episode(
     rate, lost = task.reference.rate_hz, frames[0][1] if frames else None
     kept = states.simulation(task.humanoid, rate, lost) if count == 1 else None
     came = None if push is None else push.pushed(task.humanoid, rate)
-    return Done(rollouts, recordings, judged, frames, controller, simulation=kept, pushed=came)
+    return TrackingRun(rollouts, recordings, judged, frames, controller, simulation=kept, pushed=came)
 
 
-class Told:
+class StepProgress:
     """Tells how many control steps of an episode are done."""
 
     def __init__(self, what: str, steps: int, show: Show):
@@ -280,7 +287,7 @@ class Told:
         return True
 
 
-class Keeper:
+class ResetOnFail:
     """A policy that puts characters back onto the reference before it acts, where they failed.
 
     Attributes:

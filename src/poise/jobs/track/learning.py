@@ -17,7 +17,7 @@ from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
 from poise.jobs.track.controllers import RULE
-from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.placement import PlacedMotion, place
 from poise.jobs.track.supports import Wanted, with_supports
 from poise.jobs.track.tracked import Tracked, needs_of
 from poise.jobs.track.tracking import imitation_of
@@ -83,7 +83,7 @@ LEFT = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 NEVER = 1_000_000
 
 
-class Learned(NamedTuple):
+class LearnedMotion(NamedTuple):
     """The policy that knows the motion, as far as it came, and how its run ended."""
 
     tracker: Tracker
@@ -103,7 +103,7 @@ def settings(policy: Perpetual, seed: int = 0, starts: int = 1) -> Perpetual:
 
 def learn(
     tracker: Tracker,
-    placed: Placed,
+    placed: PlacedMotion,
     folder: Path,
     until: Until,
     on_iteration: Callable[[Progress], bool | None] | None = None,
@@ -113,7 +113,7 @@ def learn(
     device: str = "cpu",
     supports: Wanted = "auto",
     help_n: float = 0.0,
-) -> Learned:
+) -> LearnedMotion:
     """Trains until the motion is tracked from its first frame to its last, or a limit is reached.
 
     Args:
@@ -144,7 +144,7 @@ def learn(
     # It tracks its recovery motions as before, or nearly; where bones are a clip's own there are none.
     learned = policy_of_run(read_run(folder))
     learned = replace(learned, recovery_clips=tracker.recovery_clips, onto=tracker.onto)
-    return Learned(learned, result)
+    return LearnedMotion(learned, result)
 
 
 def help_of(folder: Path) -> float:
@@ -152,7 +152,7 @@ def help_of(folder: Path) -> float:
     return config_of(read_run(folder).meta["config"], folder).help_start
 
 
-def help_wanted(tracker: Tracker, placed: Placed, seed: int = 0, threads: int = 0) -> float | None:
+def help_wanted(tracker: Tracker, placed: PlacedMotion, seed: int = 0, threads: int = 0) -> float | None:
     """The least of some amounts of help, N, with which the policy does a motion from all over; None
     where none suffices."""
     config = settings(tracker.config, seed)

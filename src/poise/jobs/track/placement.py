@@ -40,7 +40,7 @@ TOLD_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedMotion:
     """A motion on a tracker's body.
 
     source: as it came. calm: what is followed in its place, on its own skeleton (`without_noise`).
@@ -59,7 +59,7 @@ class Placed:
     notes: tuple[str, ...]
 
 
-def place(clip: Clip, tracker: Tracker) -> Placed:
+def place(clip: Clip, tracker: Tracker) -> PlacedMotion:
     """The motion on the tracker's body; a cycle is tracked once.
 
     Raises:
@@ -71,7 +71,9 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     fit = ClipFit(clip.name, judge_rate(clip), on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
     notes = (*_read_noise(clip), *on.cleaned.noise_sentences(), *_root_told(clip, on.calm), *notes)
-    return Placed(clip, on.calm, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
+    return PlacedMotion(
+        clip, on.calm, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes
+    )
 
 
 def _read_noise(clip: Clip) -> tuple[str, ...]:
@@ -95,7 +97,7 @@ def noise_read(clip: Clip) -> list[Fault]:
     return [f for f in read_faults(clip) if f.kind == "tremble"]
 
 
-def place_all(clips: Sequence[Clip], tracker: Tracker) -> list[Placed]:
+def place_all(clips: Sequence[Clip], tracker: Tracker) -> list[PlacedMotion]:
     """Motions on the tracker's body between which recovery motions can lead, in one world, each at its
     own place, all on the first one's skeleton.
 
@@ -106,7 +108,7 @@ def place_all(clips: Sequence[Clip], tracker: Tracker) -> list[Placed]:
     Raises:
         PoiseError: see `place`.
     """
-    first, out = clips[0], list[Placed]()
+    first, out = clips[0], list[PlacedMotion]()
     for clip in clips:
         notes: tuple[str, ...] = ()
         if not clip.skeleton.same_bones(first.skeleton):
@@ -136,7 +138,7 @@ def _unwound(qpos: np.ndarray, tracker: Tracker) -> np.ndarray:
     return out
 
 
-def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
+def home(motion: Clip, placed: PlacedMotion, tracker: Tracker) -> Clip:
     """A motion of the body on the skeleton that came in, at its size.
 
     Joints that the body does not have, such as fingers, move as they did in the source.
@@ -225,7 +227,7 @@ def fitted(points: Keypoints, smooth_hz: float | None = None) -> Clip:
 
 def follow(
     tracker: Tracker,
-    placed: Placed,
+    placed: PlacedMotion,
     points: Keypoints,
     reference: Reference,
     smooth_hz: float | None = None,

@@ -11,9 +11,9 @@ import torch
 
 from poise.env import Acts
 from poise.errors import PoiseError
-from poise.jobs.track.controllers import Show, Told, look_ahead
+from poise.jobs.track.controllers import Show, StepProgress, look_ahead
 from poise.jobs.track.direction import Direction
-from poise.jobs.track.placement import Placed
+from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.tracker import Tracker
 from poise.kinematics.loops import best_period, overlap_of, repeated
 from poise.kinematics.rate import RateJudgement, usual_rate
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 TRIED, USUAL = (0.5, 2.0), 0.02
 
 
-def rate_doubts(placed: Sequence[Placed]) -> list[str]:
+def rate_doubts(placed: Sequence[PlacedMotion]) -> list[str]:
     """Sentences on frame rates that physics speaks against, known before anything is simulated; of
     several motions each names its own."""
     out = []
@@ -116,7 +116,7 @@ def _done(task: Imitation, acts: Acts, show: Show | None = None, what: str = "")
     last = task.reference.length[:1] - 1
     env, first = task.bare().env(1, None, False, 1, help_scale=0.0, guard=False), torch.zeros_like(last)
     judge = ClipJudge(last)
-    told = () if show is None else (Told(what, int(last), show),)
+    told = () if show is None else (StepProgress(what, int(last), show),)
     try:
         if isinstance(acts, Lookahead):
             acts.watch(env)

@@ -14,7 +14,7 @@ from torch import Tensor
 from poise.env import Acts, ImitationEnv, Reference
 from poise.env.led import TRACKS, LedGoal
 from poise.errors import PoiseError
-from poise.jobs.track.placement import Placed
+from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.tracker import Tracker
 from poise.kinematics import FitReport, qpos_to_clip
 from poise.kinematics.feet import Levelled
@@ -26,7 +26,7 @@ from poise.score import simulate
 
 
 @dataclass(eq=False)
-class Replay:
+class ReplayActions:
     """Actions `(T, A)` one after another, for the one character that they were made for; after them
     acts the policy, if there is one. by: the controller that made them."""
 
@@ -65,9 +65,9 @@ def look_for(
         env.close()
 
 
-def replay(found: SamplingResult, policy: Acts) -> Replay:
+def replay(found: SamplingResult, policy: Acts) -> ReplayActions:
     """Does what was found, and from where it was lost what the policy does."""
-    return Replay(found.actions[: found.reached].clone(), policy)
+    return ReplayActions(found.actions[: found.reached].clone(), policy)
 
 
 #: A clip that is lost more often within so many s of it is given up, and so is one that the character
@@ -100,7 +100,7 @@ class Losses:
         return said
 
 
-class Led(NamedTuple):
+class RecoveryRun(NamedTuple):
     """What came of motions to which a character was led.
 
     Attributes:
@@ -112,21 +112,21 @@ class Led(NamedTuple):
             did not end.
     """
 
-    placed: Placed
+    placed: PlacedMotion
     imitation: Imitation
-    replayed: Replay
+    replayed: ReplayActions
     losses: Losses | None
     spans: list[tuple[int | None, int | None]]
 
 
 def led_along(
     tracker: Tracker,
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedMotion],
     imitation: Imitation,
     returns: bool,
     ahead: Lookahead | None = None,
     show: Callable[[int, int], None] | None = None,
-) -> Led:
+) -> RecoveryRun:
     """Tracks motions one after another, a recovery motion from the end of each to the start of the next,
     and one wherever a motion is lost.
 
@@ -165,10 +165,10 @@ def led_along(
         simulate(env, ahead or tracker.policy, obs, most, led)
     finally:
         env.close()
-    replayed = Replay(torch.cat(led.actions))
+    replayed = ReplayActions(torch.cat(led.actions))
     losses = Losses(tuple(led.lost), tuple(led.back), tuple(led.given_up)) if led.lost else None
     if losses is None and len(placed) == 1:
-        return Led(placed[0], imitation, replayed, None, led.spans)
+        return RecoveryRun(placed[0], imitation, replayed, None, led.spans)
     qpos, body, rate = torch.cat(led.frames).cpu().numpy(), imitation.humanoid, led.rate
     own = _held(imitation.library.clips, rate, led.of)
     clip = qpos_to_clip(qpos, body.table, own.skeleton, rate, own, own.name)
@@ -177,7 +177,7 @@ def led_along(
     library = ClipLibrary((whole.clip,), (1.0,))
     reference = Reference(body, [qpos], rate, [own.name])
     out = replace(imitation, library=library, reference=reference)
-    return Led(whole, out, replayed, losses, led.spans)
+    return RecoveryRun(whole, out, replayed, losses, led.spans)
 
 
 class _Led:
@@ -189,7 +189,7 @@ class _Led:
         actions: `(1, A)` each.
         lost, back: when it lost a motion and found it again, s.
         given_up: when it left a clip for the next one, s.
-        spans: see `Led`.
+        spans: see `RecoveryRun`.
     """
 
     def __init__(self, goal: LedGoal, start: Tensor, show: Callable[[int, int], None] | None = None):
@@ -248,11 +248,11 @@ class _Led:
 
 
 def one_after_another(
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedMotion],
     of: Sequence[tuple[int, int]],
     spans: Sequence[tuple[int | None, int | None]],
     rate: float,
-) -> Placed:
+) -> PlacedMotion:
     """What came in as one motion: frames `of` (clip, frame) of all at `rate`, at the first one's rate.
 
     Feet are turned as in each clip, and in between from one to the other.

@@ -15,7 +15,7 @@ from poise.env import Acts, ImitationEnv, Reference
 from poise.env.recovery.clips import mixed
 from poise.errors import PoiseError
 from poise.formats import read_clip
-from poise.jobs.track.controllers import RULE, Done, Show, Told, episode, look_ahead
+from poise.jobs.track.controllers import RULE, Show, StepProgress, TrackingRun, episode, look_ahead
 from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.simulation import Retake, Simulation, States
 from poise.jobs.tracker import Tracker
@@ -39,7 +39,7 @@ PRICE = 120.0
 TRIES = 3
 
 
-class Taken(NamedTuple):
+class Segment(NamedTuple):
     """What was simulated anew.
 
     Attributes:
@@ -62,7 +62,7 @@ def retaken(
     retake: Retake,
     show: Show | None = None,
     prices: Tensor | None = None,
-) -> tuple[Done, Sequence[str]]:
+) -> tuple[TrackingRun, Sequence[str]]:
     """Does a part of a task's motion anew, and the rest as it was done; sentences on that.
 
     Raises:
@@ -77,9 +77,9 @@ def retaken(
     for k in range(TRIES):
         how = replace(config, seed=config.seed + k)
         taken = _take(tracker, goals, how, before, first, last, show, prices)
-        if isinstance(taken, Taken):
+        if isinstance(taken, Segment):
             break
-    if not isinstance(taken, Taken):
+    if not isinstance(taken, Segment):
         raise PoiseError(
             f"the part from {first / rate:.1f} s on was lost at {taken / rate:.1f} s with {TRIES} seeds",
             hint="Widen --range, raise --budget, or track the whole motion",
@@ -128,7 +128,7 @@ def _goals(imitation: Imitation, before: Simulation, last: int) -> Imitation:
 def _take(
     tracker: Tracker, goals: Imitation, config: TrackConfig, before: Simulation, first: int, last: int,
     show: Show | None, prices: Tensor | None,
-) -> Taken | int:  # fmt: skip
+) -> Segment | int:  # fmt: skip
     """Simulates a part; or the frame at which it was lost."""
     rate, end = before.rate_hz, before.frames - 1
     settle, fade = round(SETTLE_S * rate), max(2, round(FADE_S * rate))
@@ -149,7 +149,7 @@ def _take(
         if isinstance(acts, Lookahead):
             acts.remember(0, goals.reference.poser(*_rows(before, max(0, first - PAST), first)).pos)
         seen, lost = States(), _Lost(first)
-        told = [] if show is None else [Told("looking ahead", stop - first, show)]
+        told = [] if show is None else [StepProgress("looking ahead", stop - first, show)]
         simulate(env, acts, obs, stop - first, seen, lost, *told)
     finally:
         env.close()
@@ -159,7 +159,7 @@ def _take(
         return lost.frame
     made = seen.simulation(goals.humanoid, rate, None)
     if not joins:
-        return Taken(made, first, None, 0.0)
+        return Segment(made, first, None, 0.0)
     # The mean distance over each window in which the one may fade into the other.
     pose = goals.reference.poser
     own, old = pose(made.qpos, made.qvel).pos, pose(*_rows(before, first, stop + 1)).pos
@@ -167,7 +167,7 @@ def _take(
     windows = apart.unfold(0, fade + 1, 1).mean(1)
     waits = torch.arange(len(windows)) / rate * PATIENCE_MM
     best = int((windows + waits).argmin())
-    return Taken(made, first, last + best, float(windows[best]))
+    return Segment(made, first, last + best, float(windows[best]))
 
 
 def _rows(before: Simulation, first: int, end: int) -> tuple[Tensor, Tensor]:
@@ -206,7 +206,7 @@ class _Lost:
         return self.frame is not None
 
 
-def _joined(before: Simulation, taken: Taken, rate: float) -> Simulation:
+def _joined(before: Simulation, taken: Segment, rate: float) -> Simulation:
     """The whole motion, one simulation fading into the other."""
     made, first = taken.made, taken.first
     if taken.joined is None:
@@ -228,7 +228,7 @@ def _joined(before: Simulation, taken: Taken, rate: float) -> Simulation:
     return replace(before, qpos=qpos, qvel=qvel, action=action)
 
 
-def _played(imitation: Imitation, config: TrackConfig, whole: Simulation) -> Done:
+def _played(imitation: Imitation, config: TrackConfig, whole: Simulation) -> TrackingRun:
     """One episode in which the character is in every frame as a simulation has it."""
     by = "lookahead" if config.looks_ahead else "policy"
     done = episode(imitation, config, _Player(whole), by)
@@ -272,7 +272,7 @@ def eased(share: Tensor) -> Tensor:
     return s**3 * (s * (6.0 * s - 15.0) + 10.0)
 
 
-def _sentence(taken: Taken, before: Simulation, first: int, last: int, rate: float) -> str:
+def _sentence(taken: Segment, before: Simulation, first: int, last: int, rate: float) -> str:
     said = f"From {first / rate:.2f} s to {last / rate:.2f} s the motion was simulated anew"
     if before.lost is not None:
         return f"{said}, since the earlier one was lost at {before.lost / rate:.1f} s."

@@ -19,7 +19,7 @@ from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 FILE = "simulation.safetensors"
 
 
-class _Meta(TypedDict):
+class _SimulationMeta(TypedDict):
     kind: str
     rate_hz: float
     bodies: list[str]
@@ -145,7 +145,7 @@ def read_simulation(path: Path) -> Simulation:
             "Give the folder that poise track or complete wrote for a single clip",
             code="simulation-missing",
         )  # fmt: skip
-    tensors, meta = load_checkpoint(file, _Meta)
+    tensors, meta = load_checkpoint(file, _SimulationMeta)
     if meta["kind"] != "simulation":
         raise PoiseError("the file holds no simulation", file, code="wrong-file-kind")
     return _checked(tensors, meta, file)

@@ -17,7 +17,7 @@ from poise.errors import PoiseError
 from poise.formats.figure import SceneBox
 from poise.formats.gltf_write import write_gltf
 from poise.formats.text import write_whole
-from poise.jobs.track.placement import Placed
+from poise.jobs.track.placement import PlacedMotion
 from poise.kinematics.find_supports import find_supports
 from poise.kinematics.supports import Support
 from poise.motion import Clip
@@ -32,7 +32,7 @@ DEEP_M = 0.1
 
 
 def with_supports(
-    imitation: Imitation, wanted: Wanted, placed: Placed
+    imitation: Imitation, wanted: Wanted, placed: PlacedMotion
 ) -> tuple[tuple[Support, ...], Imitation]:
     """Supports of a task's only motion, in its body's world, and the task with them.
 
@@ -60,14 +60,14 @@ def supported(imitation: Imitation, supports: Sequence[Support]) -> Imitation:
     return made
 
 
-def on_body(supports: Sequence[Support], placed: Placed) -> tuple[Support, ...]:
+def on_body(supports: Sequence[Support], placed: PlacedMotion) -> tuple[Support, ...]:
     """Supports that were stated beside the motion that came in, in the world of the body, which is as
     much larger as the body, about where the motion begins, and has its floor at z = 0."""
     scaled = _scaled(supports, placed, placed.moved.scale if placed.moved else 1.0)
     return _raised(scaled, placed.report.clips[0].ground.lift_m)
 
 
-def at_home(supports: Sequence[Support], placed: Placed) -> tuple[Support, ...]:
+def at_home(supports: Sequence[Support], placed: PlacedMotion) -> tuple[Support, ...]:
     """Supports beside the motion on the skeleton that came in."""
     lowered = _raised(supports, -placed.report.clips[0].ground.lift_m)
     return _scaled(lowered, placed, 1.0 / placed.moved.scale if placed.moved else 1.0)
@@ -84,7 +84,7 @@ def write_supports(supports: Sequence[Support], clip: Clip, out: Path, motion: P
     return {"supports": stated} | ({} if scene == motion else {"scene": scene})
 
 
-def _scaled(supports: Sequence[Support], placed: Placed, scale: float) -> tuple[Support, ...]:
+def _scaled(supports: Sequence[Support], placed: PlacedMotion, scale: float) -> tuple[Support, ...]:
     if scale == 1.0:
         return tuple(supports)
     x, y, _ = (float(v) for v in placed.source.root_pos[0])

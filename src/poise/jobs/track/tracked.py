@@ -18,10 +18,10 @@ from poise.env import Reference
 from poise.errors import PoiseError
 from poise.formats import home_suffix, write_clip
 from poise.jobs.deliver import Delivery, as_high_as_source, deliver, finished, settled, simulated_clip
-from poise.jobs.result import Result, Shown
+from poise.jobs.result import Result, ResultView
 from poise.jobs.runs import Evaluation
 from poise.jobs.track.controllers import LOST, SURVIVED, Merit, merit
-from poise.jobs.track.placement import Placed, fitted, home, noise_read, place
+from poise.jobs.track.placement import PlacedMotion, fitted, home, noise_read, place
 from poise.jobs.track.pushed import Pushed
 from poise.jobs.track.rates import InPlace
 from poise.jobs.track.recovering import Losses
@@ -174,7 +174,7 @@ Span = tuple[int | None, int | None]
 
 
 @dataclass(frozen=True)
-class Part:
+class ChainPart:
     """What became of one of several clips; times are s of what came out.
 
     Attributes:
@@ -247,26 +247,26 @@ def cut(r: RolloutSet, spans: Sequence[Span], reference: Reference) -> RolloutSe
     )
 
 
-def parts_of(rollouts: RolloutSet, spans: Sequence[Span], rule: str, returns: bool) -> list[Part]:
+def parts_of(rollouts: RolloutSet, spans: Sequence[Span], rule: str, returns: bool) -> list[ChainPart]:
     """What became of each clip.
 
     rollouts: what `cut` gave. returns: whether the character comes back to a clip that it lost.
     """
     failed = judge(rollouts, success_rule(rule)).failed_at.tolist()
-    out, before = list[Part](), 0
+    out, before = list[ChainPart](), 0
     for (b, e), name, fail in zip(spans, rollouts.clip_names, failed, strict=True):
         if b is None:
-            out.append(Part(name))
+            out.append(ChainPart(name))
             continue
         lost = (b + fail) / rollouts.fps if fail >= 0 else None
         ends = None if e is None else e / rollouts.fps
         back = returns and lost is not None and e is not None
-        out.append(Part(name, b / rollouts.fps, ends, (b - before) / rollouts.fps, lost, back))
+        out.append(ChainPart(name, b / rollouts.fps, ends, (b - before) / rollouts.fps, lost, back))
         before = b if e is None else e
     return out
 
 
-def with_parts(card: ScoreCard, parts: Sequence[Part]) -> ScoreCard:
+def with_parts(card: ScoreCard, parts: Sequence[ChainPart]) -> ScoreCard:
     """The score card with the times of each part beside its figures."""
     rows = zip(card.per_clip, parts, strict=True)
     told = tuple(
@@ -318,14 +318,14 @@ class Tracked(Result):
     tracker: Tracker
     imitation: Imitation
     evaluation: Evaluation
-    placed: Placed
+    placed: PlacedMotion
     failures: tuple[tuple[int, float], ...]
     clean: Clean | None
     notes: tuple[str, ...]
     losses: Losses | None = None
     found: SamplingResult | None = None
     controller: str = "policy"
-    parts: tuple[Part, ...] = ()
+    parts: tuple[ChainPart, ...] = ()
     supports: tuple[Support, ...] = ()
     pins: tuple[Pin, ...] = ()
     simulation: Simulation | None = None
@@ -406,9 +406,9 @@ class Tracked(Result):
             earlier = replace(self, evaluation=was, retake=None, travel=None).delivered(0, hold)
         return spliced(earlier, motion, span)
 
-    def _shown(self) -> Shown:
+    def _shown(self) -> ResultView:
         source = self.placed.source if self.travel is None else self.travel.beside
-        return Shown(self.clip, source, self.card, self.notes)
+        return ResultView(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         return write(self, folder).paths
@@ -510,7 +510,7 @@ class BesideRaw:
 
 
 def beside_raw(
-    tracker: Tracker, motion: Clip | Keypoints, placed: Placed, sim: Tensor, judged: Tensor
+    tracker: Tracker, motion: Clip | Keypoints, placed: PlacedMotion, sim: Tensor, judged: Tensor
 ) -> BesideRaw | None:
     """The character `sim (T, B, 3)` m in the frames `judged (T)`, None where no tremble was taken off.
 

@@ -23,7 +23,7 @@ from poise.formats.raw import ReadOptions
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track.controllers import RULE, Show, done_by, led_by
-from poise.jobs.track.placement import Placed, fitted, follow, place, place_all, points_of
+from poise.jobs.track.placement import PlacedMotion, fitted, follow, place, place_all, points_of
 from poise.jobs.track.pushed import with_push
 from poise.jobs.track.rates import InPlace, rate_doubts, rate_notes, with_travel
 from poise.jobs.track.retaking import retaken
@@ -200,7 +200,7 @@ def track(
     )  # fmt: skip
 
 
-def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
+def imitation_of(tracker: Tracker, placed: Sequence[PlacedMotion]) -> Imitation:
     """Motions on the tracker's body as one task; the report is that of the first.
 
     Where a motion leaves the range of a hinge, the range is widened if no action is measured by it: a

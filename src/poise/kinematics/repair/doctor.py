@@ -19,7 +19,13 @@ from poise.kinematics.rate import judge_rate
 from poise.kinematics.repair.estimate import CleanReport, clean_clip, denoise, noise_faults
 from poise.kinematics.repair.faults import KINDS, Fault, by_kind, read_faults, spell_faults
 from poise.kinematics.repair.speeds import jitter_faults, mend_jitter
-from poise.kinematics.repair.support import Support, anatomy_of, height_faults, slide_faults, support_of
+from poise.kinematics.repair.support import (
+    FloorPoints,
+    anatomy_of,
+    height_faults,
+    slide_faults,
+    support_of,
+)
 from poise.kinematics.repair.timing import (
     body_steps,
     mend_drift,
@@ -154,11 +160,13 @@ def without_noise(clip: Clip) -> tuple[Clip, CleanReport]:
     return healed, replace(report, left=(), kept=())
 
 
-def _supports(anatomy: Anatomy, clip: Clip, support: Support | None) -> Callable[[Clip], Support | None]:
+def _supports(
+    anatomy: Anatomy, clip: Clip, support: FloorPoints | None
+) -> Callable[[Clip], FloorPoints | None]:
     """`support_of`, which knows that of the last clip: a step that changes nothing gives it back."""
     last = [(clip, support)]
 
-    def of(clip: Clip) -> Support | None:
+    def of(clip: Clip) -> FloorPoints | None:
         if last[0][0] is not clip:
             last[0] = clip, support_of(clip, anatomy)
         return last[0][1]
@@ -171,7 +179,7 @@ def _healed(
     anatomy: Anatomy,
     path: bool | None,
     found: Examination | None = None,
-    known: Support | None = None,
+    known: FloorPoints | None = None,
 ) -> Clip:
     of = _supports(anatomy, clip, support_of(clip, anatomy) if known is None else known)
     clip = mend_holds(clip)
@@ -198,7 +206,7 @@ def _healed(
     return clip if support is None else set_on_floor(clip, support, whole=False)
 
 
-def set_on_floor(clip: Clip, support: Support, whole: bool = True) -> Clip:
+def set_on_floor(clip: Clip, support: FloorPoints, whole: bool = True) -> Clip:
     """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is.
 
     First the `whole` of it, by what its soles say; then spells that hover or sink, smoothed over 0.2 s.
@@ -221,7 +229,9 @@ def set_on_floor(clip: Clip, support: Support, whole: bool = True) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, of: Callable[[Clip], Support | None], path: bool | None, shaken: bool) -> Clip:
+def _locked(
+    clip: Clip, of: Callable[[Clip], FloorPoints | None], path: bool | None, shaken: bool
+) -> Clip:
     """The clip without sliding feet. of: see `_supports`. path: see `heal`. shaken: whether they
     trembled."""
     for step in range(1 + SLIDE_ROUNDS):
@@ -276,7 +286,7 @@ def limit_faults(clip: Clip) -> list[Fault]:
     return out
 
 
-def _rate_faults(support: Support, clip: Clip) -> list[Fault]:
+def _rate_faults(support: FloorPoints, clip: Clip) -> list[Fault]:
     judged = judge_rate(clip, support.table)
     if judged.likely is None:
         return []
@@ -284,7 +294,7 @@ def _rate_faults(support: Support, clip: Clip) -> list[Fault]:
     return [Fault("frame rate", "", 0, clip.frames - 1, judged.likely, detail)]
 
 
-def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
+def _figures(clip: Clip, support: FloorPoints | None) -> dict[str, float | None]:
     """Measures of the whole clip; lengths are told against the floor at z = 0."""
     pos = torch.tensor(clip.positions())
     shake = jerk(pos, clip.fps)

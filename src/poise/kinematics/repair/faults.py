@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from poise.formats.point_noise import Tremble
+from poise.formats.point_noise import RemovedTremble
 from poise.motion import Clip
 from poise.motion.smoothing import find_runs
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """title: in words. unit: of `Fault.size`. repair: how it is mended; empty where it is not."""
 
     title: str
@@ -23,27 +23,27 @@ class Kind(NamedTuple):
 
 #: In the order in which they are mended, then those that are only told.
 KINDS = {
-    "frozen frames": Kind("frames that repeat the one before", "frames", "filled in or left out"),
-    "missing frames": Kind("a gap of frames", "frames"),
-    "teleport": Kind("the root jumps", "m", "the path is joined by its usual step"),
-    "flip": Kind("turned where no joint reaches", "degrees", "turned back"),
-    "speed": Kind("faster than a human joint", "rad/s", "interpolated, held or smoothed"),
-    "spike": Kind("leaps away for a frame or two", "degrees", "put on the smoothest curve"),
-    "held": Kind("stands still, then leaps on", "degrees", "put on the smoothest curve"),
-    "tremble": Kind("the whole body trembles", "mm", "taken off, and no more than it is"),
-    "jitter": Kind("trembles from frame to frame", "mm", "smoothed without delay"),
-    "root jitter": Kind("the root trembles from frame to frame", "mm", "smoothed without delay"),
-    "float": Kind("hovers without falling", "cm", "lowered to the floor"),
-    "penetration": Kind("lies under the floor", "cm", "lifted out of the floor"),
-    "foot slide": Kind("slides while it stands", "cm", "held in place, the leg follows"),
-    "joint jump": Kind("faster than a human joint, and a repair would jerk the body more", "rad/s"),
-    "out of reach": Kind("stays where no joint reaches", "frames"),
-    "limit": Kind("beyond the file's own limits", "degrees"),
-    "bone drift": Kind("its bone changes its length or place", "mm", "kept rigid when it is read"),
-    "quaternion length": Kind("quaternions off unit length", "", "normalised when they are read"),
-    "rest frame": Kind("a rest pose put before the motion", "frames", "left out when it is read"),
-    "frame rate": Kind("gravity contradicts the frame rate", "frames/s"),
-    "sides": Kind("left and right are exchanged or mirrored", ""),
+    "frozen frames": FaultKind("frames that repeat the one before", "frames", "filled in or left out"),
+    "missing frames": FaultKind("a gap of frames", "frames"),
+    "teleport": FaultKind("the root jumps", "m", "the path is joined by its usual step"),
+    "flip": FaultKind("turned where no joint reaches", "degrees", "turned back"),
+    "speed": FaultKind("faster than a human joint", "rad/s", "interpolated, held or smoothed"),
+    "spike": FaultKind("leaps away for a frame or two", "degrees", "put on the smoothest curve"),
+    "held": FaultKind("stands still, then leaps on", "degrees", "put on the smoothest curve"),
+    "tremble": FaultKind("the whole body trembles", "mm", "taken off, and no more than it is"),
+    "jitter": FaultKind("trembles from frame to frame", "mm", "smoothed without delay"),
+    "root jitter": FaultKind("the root trembles from frame to frame", "mm", "smoothed without delay"),
+    "float": FaultKind("hovers without falling", "cm", "lowered to the floor"),
+    "penetration": FaultKind("lies under the floor", "cm", "lifted out of the floor"),
+    "foot slide": FaultKind("slides while it stands", "cm", "held in place, the leg follows"),
+    "joint jump": FaultKind("faster than a human joint, and a repair would jerk the body more", "rad/s"),
+    "out of reach": FaultKind("stays where no joint reaches", "frames"),
+    "limit": FaultKind("beyond the file's own limits", "degrees"),
+    "bone drift": FaultKind("its bone changes its length or place", "mm", "kept rigid when it is read"),
+    "quaternion length": FaultKind("quaternions off unit length", "", "normalised when they are read"),
+    "rest frame": FaultKind("a rest pose put before the motion", "frames", "left out when it is read"),
+    "frame rate": FaultKind("gravity contradicts the frame rate", "frames/s"),
+    "sides": FaultKind("left and right are exchanged or mirrored", ""),
 }
 
 
@@ -67,7 +67,7 @@ class Fault:
     @classmethod
     def tremble(cls, start: int, stop: int, mm: float, hz: float | None) -> Fault:
         """A tremble of the whole body at a frequency, or from frame to frame."""
-        return cls("tremble", "", start, stop, mm, Tremble(mm, hz).how, hz)
+        return cls("tremble", "", start, stop, mm, RemovedTremble(mm, hz).how, hz)
 
     @property
     def repairable(self) -> bool:

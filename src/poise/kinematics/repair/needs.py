@@ -216,7 +216,7 @@ def find_needs(
         table: the body. pos, quat: `(T, B, 3)` m and `(T, B, 4)` wxyz, places of its rows in the world.
     """
     rules = rules or AloneRules()
-    body = _Body(table, pos.double(), quat.double(), fps, rules)
+    body = _BodyShape(table, pos.double(), quat.double(), fps, rules)
     found: list[Need] = []
     for spell in beyond_a_floor(table, body.pos, body.quat, fps, rules):
         what = body.need(spell)
@@ -231,7 +231,7 @@ def find_needs(
     return tuple(found)
 
 
-class _Body:
+class _BodyShape:
     """Where the parts of a body are, and what a spell looks like."""
 
     def __init__(self, table: BodyTable, pos: Tensor, quat: Tensor, fps: float, rules: AloneRules):

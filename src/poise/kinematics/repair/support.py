@@ -37,7 +37,7 @@ HOVER_MORE_M, GAP_S = 0.005, 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
+class FloorPoints:
     """Points of one clip that may touch the floor; metres, world, Z up.
 
     soles: `(T, F, 3)` heel and toe end of every sole. feet: `(F,)` the foot joint of each.
@@ -62,7 +62,7 @@ class Support:
     labels: np.ndarray | None = None
 
     @classmethod
-    def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
+    def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> FloorPoints:
         """The support of a clip with the body `table`, which was made from it."""
         world = [torch.tensor(x) for x in clip.world()]
         pos, quat = (x[:, [r.joint for r in table.rows]] for x in world)
@@ -138,13 +138,13 @@ def anatomy_of(clip: Clip) -> Anatomy:
         return Anatomy((), ())
 
 
-def support_of(clip: Clip, anatomy: Anatomy) -> Support | None:
+def support_of(clip: Clip, anatomy: Anatomy) -> FloorPoints | None:
     """The support of a clip, None where no body can be made for its skeleton."""
     try:
         table = generate_table(clip.skeleton, None, [clip])
     except PoiseError:
         return None
-    return Support.of(clip, anatomy, table) if anatomy.parts else None
+    return FloorPoints.of(clip, anatomy, table) if anatomy.parts else None
 
 
 def sole_slide(clip: Clip) -> float | None:
@@ -170,7 +170,7 @@ def _low_points(
     return torch.stack(columns, -1).numpy(), np.array(margins), tuple(names)
 
 
-def height_faults(clip: Clip, support: Support) -> list[Fault]:
+def height_faults(clip: Clip, support: FloorPoints) -> list[Fault]:
     """Where the body is above or under the floor; the whole clip once, then what differs from it."""
     last, off = clip.frames - 1, support.off_m
     out = drift_faults(support.sole_low, clip.fps, support.flying)
@@ -192,7 +192,7 @@ def height_faults(clip: Clip, support: Support) -> list[Fault]:
     return out
 
 
-def slide_faults(clip: Clip, support: Support) -> list[Fault]:
+def slide_faults(clip: Clip, support: FloorPoints) -> list[Fault]:
     """Spells in which a standing foot travels over the floor, in cm between the ends of its way."""
     out = []
     for foot, slip, contact in foot_slips(support):
@@ -208,7 +208,7 @@ def slide_faults(clip: Clip, support: Support) -> list[Fault]:
     return sorted(out, key=lambda f: f.start)
 
 
-def foot_slips(support: Support) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def foot_slips(support: FloorPoints) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Per foot joint: velocity `(T - 1, 2)` m/s of its slowest point in contact, contact `(T - 1)`.
 
     The sole of a rolling foot has one point that rests; where none is in contact the velocity is zero.

@@ -190,7 +190,7 @@ _BORNE, _SMOOTH_S = 0.5, 0.05
 HELD_S, RISES = 0.6, 0.02
 
 
-class Drift(NamedTuple):
+class HeightDrift(NamedTuple):
     """speed: m/s, upwards. at_start: m, the drifting floor in frame 0. frames, fps: the clip's."""
 
     speed: float
@@ -210,7 +210,7 @@ class Drift(NamedTuple):
         return line - stays
 
 
-def find_drift(low: np.ndarray, fps: float) -> Drift | None:
+def find_drift(low: np.ndarray, fps: float) -> HeightDrift | None:
     """The steady drift of the lowest points `(T)` m of a body, None where there is none.
 
     The line that the lower half of the points keep to must climb by `LEAST_M`, half of all points must
@@ -226,7 +226,7 @@ def find_drift(low: np.ndarray, fps: float) -> Drift | None:
         over = low - (start + speed * t)
         # Swinging and flying bodies are above their floor, never below.
         on = over <= np.quantile(over, 0.6)
-    drift = Drift(float(speed), float(start), frames, fps)
+    drift = HeightDrift(float(speed), float(start), frames, fps)
     if abs(drift.size_m) < LEAST_M:
         return None
     over = low - (start + speed * t)

@@ -14,8 +14,8 @@ from poise.body.topology import subtree
 from poise.errors import PoiseError
 from poise.kinematics.forward import carried
 from poise.kinematics.retarget.standing import (
+    ClipWorld,
     Stances,
-    World,
     hinge_axis,
     identity,
     mean_pose,
@@ -71,14 +71,16 @@ class CommonPose:
     sole: float
     evidence: str
 
-    def depth(self, world: World, ground: float = 0.0, joints: Collection[int] | None = None) -> Tensor:
+    def depth(
+        self, world: ClipWorld, ground: float = 0.0, joints: Collection[int] | None = None
+    ) -> Tensor:
         """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
 
         The floor lies as far under the `ground` of the treads as the soles do while standing.
         """
         return (ground - self.sole - self.lowest(world, joints)).clamp_min(0.0)
 
-    def lowest(self, world: World, joints: Collection[int] | None = None) -> Tensor:
+    def lowest(self, world: ClipWorld, joints: Collection[int] | None = None) -> Tensor:
         """`(T)` m, the lowest of those of `joints` (default: all) that are parts of the body, of their
         tips and treads; infinite without any part."""
         roles, (pos, quat) = self.roles, world
@@ -93,7 +95,7 @@ class CommonPose:
         return torch.stack(heights, -1).min(-1).values
 
 
-def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = None) -> CommonPose:
+def common_pose(roles: Roles, clip: Clip | None = None, world: ClipWorld | None = None) -> CommonPose:
     """How the skeleton of `roles` stands in the pose that all skeletons share.
 
     It starts from the rest pose where a person could stand so, else from the mean pose of the upright
@@ -111,7 +113,7 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
     roles.require()
     _check_hips(roles)
     if clip is not None and world is None:
-        world = World.of(clip)
+        world = ClipWorld.of(clip)
     at_rest = rest_axes(roles)
     if at_rest is not None:
         local = torch.zeros(len(roles.skeleton), 4, dtype=torch.float64)
@@ -153,7 +155,7 @@ class _Builder:
         roles: Roles,
         local: Tensor,
         clip: Clip | None,
-        world: World | None,
+        world: ClipWorld | None,
         rested: bool,
         evidence: str,
     ) -> None:
@@ -204,7 +206,7 @@ class _Builder:
         tips = tuple((r.joint, v) for r in self.roles.rows if (v := self._believed(r.joint)) is not None)
         arrays = pos.numpy(), rot.numpy(), above.numpy(), treads.numpy()
         pose = CommonPose(self.roles, *arrays, -tread, tips, 0.0, self.evidence)
-        low = pose.lowest(World(pos[None], rot[None]))
+        low = pose.lowest(ClipWorld(pos[None], rot[None]))
         return replace(pose, sole=max(0.0, tread - float(low[0])))
 
     def _align_hinge(self, rot: Tensor, side: str, kinds: tuple[str, str, str]) -> None:

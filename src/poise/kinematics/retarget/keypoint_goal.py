@@ -17,8 +17,8 @@ from poise.formats.markers import NEEDED, find_places
 from poise.formats.point_fit import FitConfig, bones_of, fit_clip
 from poise.formats.point_skeleton import Rest, Solver, hold_lengths, measure, spine_shares, trunk_tracks
 from poise.kinematics.ground import fit_heights
-from poise.kinematics.retarget.passage import Passage
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.passage import Retargeter
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.kinematics.stream_noise import of_points
 from poise.motion import Clip, Skeleton
 from poise.motion.keypoints import Keypoints
@@ -47,7 +47,7 @@ class PointBody:
     rest: Rest
     share: dict[str, float]
     bones: list[tuple[str, str, float]]
-    passage: Passage
+    passage: Retargeter
     lift: float
     notes: tuple[str, ...]
 
@@ -81,7 +81,7 @@ class PointBody:
         skeleton = onto if isinstance(onto, Skeleton) else onto.skeleton
         body = cls(
             points.names, skeleton, table, {p: found[p] for p in seen}, rest, share, bones_of(rest),
-            Passage.between(clip, onto), 0.0, clip.skeleton.source.notes,
+            Retargeter.between(clip, onto), 0.0, clip.skeleton.source.notes,
         )  # fmt: skip
         places = np.stack([_mean(points.positions, k) for k in body.places.values()], 1)
         pos, quat = body.pose(places)
@@ -102,7 +102,7 @@ class PointBody:
         """
         return self._onto(self._world(*self._solved(places)))
 
-    def _onto(self, performer: World) -> tuple[Tensor, Tensor]:
+    def _onto(self, performer: ClipWorld) -> tuple[Tensor, Tensor]:
         rot, root = self.passage.transfer(performer)
         offsets = torch.tensor(self.onto.offsets)
         pos, quat = forward_kinematics(self.onto.parents, offsets, root, rot)
@@ -126,12 +126,12 @@ class PointBody:
         tracks = hold_lengths(tracks, self.bones, LENGTH_ROUNDS)
         return Solver(self.rest, tracks, _NO_MEMORY_FPS).run()
 
-    def _world(self, root: Tensor, rot: Tensor) -> World:
+    def _world(self, root: Tensor, rot: Tensor) -> ClipWorld:
         """The measured skeleton in every frame."""
         names = list(self.rest.parents)
         parents = tuple(-1 if up is None else names.index(up) for up in self.rest.parents.values())
         offsets = torch.tensor(np.stack([self.rest.offsets[n] for n in names]))
-        return World(*forward_kinematics(parents, offsets, root, rot))
+        return ClipWorld(*forward_kinematics(parents, offsets, root, rot))
 
 
 def _mean(positions: np.ndarray, columns: tuple[int, ...]) -> np.ndarray:

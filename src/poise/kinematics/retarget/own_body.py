@@ -12,7 +12,7 @@ from poise.body import BodyConfig, BodyTable, generate_table
 from poise.errors import PoiseError
 from poise.kinematics.forward import carried
 from poise.kinematics.retarget.common_pose import CommonPose, common_pose
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.kinematics.retarget.transfer import RetargetConfig
 from poise.motion import Clip, Skeleton
 from poise.motion.roles import ARM, LEG, SHARED, SIDES, map_joints
@@ -148,7 +148,7 @@ def _arms_at_ease(pose: CommonPose, clip: Clip) -> np.ndarray:
     """
     out, roles = pose.pos.copy(), pose.roles
     chest = (*roles.chain("spine")[-1:], roles.joint("hips") or 0)[0]
-    places, quat = World.of(clip)
+    places, quat = ClipWorld.of(clip)
     turn = torch.tensor(pose.rot[chest])
     for side in SIDES:
         arm = roles.joint(f"{side}_upper_arm")

@@ -14,7 +14,7 @@ from poise.errors import PoiseError
 from poise.kinematics.feet import rest_height
 from poise.kinematics.forward import carried
 from poise.kinematics.retarget.common_pose import CommonPose, common_pose
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.motion import Clip, Skeleton
 from poise.motion.roles import SHARED, SIDES, JointMap, map_joints
 from poise.motion.rotations import (
@@ -37,7 +37,7 @@ class Scale:
 
     @staticmethod
     def between(
-        world: World, fps: float, here: CommonPose, there: CommonPose, factor: float | None
+        world: ClipWorld, fps: float, here: CommonPose, there: CommonPose, factor: float | None
     ) -> Scale:
         """Scaled by the heights of the hips over the feet, about where the clip begins on its ground."""
         factor = there.hip_height / here.hip_height if factor is None else factor
@@ -63,7 +63,7 @@ class Scale:
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
+class Retargeter:
     """From one skeleton to another: which joint moves which, how source (`here`) and target (`there`)
     stand in their common pose, and the scale of the path."""
 
@@ -79,10 +79,10 @@ class Passage:
         mapping: Mapping[str, str] | None = None,
         example: Clip | None = None,
         factor: float | None = None,
-    ) -> Passage:
+    ) -> Retargeter:
         """The passage of a clip; see `retarget`. factor: of the scale."""
         target, shown = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
-        source, world = clip.skeleton, World.of(clip)
+        source, world = clip.skeleton, ClipWorld.of(clip)
         joints = map_joints(source, target, mapping)
         if example is None:
             here = common_pose(joints.source, clip, world)
@@ -100,9 +100,9 @@ class Passage:
                 # The same hierarchy at another size, such as another subject of one data set.
                 shown = Clip(target, clip.root_pos, clip.rot, clip.fps, clip.name)
             there = common_pose(joints.target, shown)
-        return Passage(joints, here, there, Scale.between(world, clip.fps, here, there, factor))
+        return Retargeter(joints, here, there, Scale.between(world, clip.fps, here, there, factor))
 
-    def transfer(self, world_in: World, share: bool = True) -> tuple[Tensor, Tensor]:
+    def transfer(self, world_in: ClipWorld, share: bool = True) -> tuple[Tensor, Tensor]:
         """Local rotations `(T, J, 4)` and root path `(T, 3)` of the target, contacts as they come.
 
         share: see `RetargetConfig`.
@@ -143,7 +143,7 @@ def hip_middle(joints: JointMap, pos: Tensor, side: int) -> Tensor:
     return sum((pos[:, p[side]] for p in pairs if p is not None), torch.zeros(())) / 2
 
 
-def _shared(passage: Passage, turned: Tensor, share: bool) -> dict[int, Tensor]:
+def _shared(passage: Retargeter, turned: Tensor, share: bool) -> dict[int, Tensor]:
     """World turns `(T, 4)` from the common pose of the target's spine, neck and head.
 
     A chain's joints have places in [0, 1] from what carries it (0) to its last joint (1); between the

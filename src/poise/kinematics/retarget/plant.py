@@ -13,8 +13,8 @@ from poise.body.topology import subtree
 from poise.kinematics.feet import TOUCH_M, contact_labels
 from poise.kinematics.forward import carried
 from poise.kinematics.limbs import Limb, match_positions
-from poise.kinematics.retarget.passage import Passage
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.passage import Retargeter
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.motion import Clip
 from poise.motion.roles import SIDES
 from poise.motion.rotations import forward_kinematics, quat_rotate
@@ -47,7 +47,7 @@ class Foot:
         return carried(pos[:, joint], quat[:, joint], tread)
 
 
-def feet_of(passage: Passage) -> tuple[Foot, ...]:
+def feet_of(passage: Retargeter) -> tuple[Foot, ...]:
     """Both feet, and the hands that both skeletons have."""
     here, there = passage.here, passage.there
     out = []
@@ -72,7 +72,7 @@ def feet_of(passage: Passage) -> tuple[Foot, ...]:
     return tuple(out)
 
 
-def source_contacts(clip: Clip, world: World, feet: tuple[Foot, ...], ground: float) -> Tensor:
+def source_contacts(clip: Clip, world: ClipWorld, feet: tuple[Foot, ...], ground: float) -> Tensor:
     """`(T, F)` bool, which end touches the ground in the source: as its file says, else low and slow."""
     out, said = [], dict(clip.contacts)
     for foot in feet:
@@ -87,8 +87,8 @@ def source_contacts(clip: Clip, world: World, feet: tuple[Foot, ...], ground: fl
 
 def plant(
     clip: Clip,
-    world: World,
-    passage: Passage,
+    world: ClipWorld,
+    passage: Retargeter,
     rot: Tensor,
     root: Tensor,
     feet: tuple[Foot, ...],
@@ -109,7 +109,7 @@ def plant(
 
     def lift(pos: Tensor, quat: Tensor, parts: Collection[int]) -> Tensor:
         """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
-        excess = passage.there.depth(World(pos, quat), scale.ground, parts) - depth
+        excess = passage.there.depth(ClipWorld(pos, quat), scale.ground, parts) - depth
         if float(excess.max()) < 1e-6:
             return torch.zeros(len(pos), dtype=pos.dtype)
         return torch.tensor(smooth_lift(excess.clamp_min(0.0).numpy(), clip.fps, LIFT_S, clip.cyclic))

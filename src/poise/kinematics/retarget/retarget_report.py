@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kinematics.retarget.passage import Passage, Scale, hip_middle
+from poise.kinematics.retarget.passage import Retargeter, Scale, hip_middle
 from poise.kinematics.retarget.plant import Foot
-from poise.kinematics.retarget.standing import World, body_axes
+from poise.kinematics.retarget.standing import ClipWorld, body_axes
 from poise.metrics.tracking import MM
 from poise.motion.roles import SIDES, JointMap
 from poise.motion.rotations import normalize
@@ -104,9 +104,9 @@ class RetargetReport:
 
 
 def measure(
-    worlds: tuple[World, World],
+    worlds: tuple[ClipWorld, ClipWorld],
     fps: float,
-    passage: Passage,
+    passage: Retargeter,
     feet: tuple[Foot, ...],
     contacts: Tensor,
     seconds: float,
@@ -163,7 +163,7 @@ def _bones(joints: JointMap, source: Tensor, target: Tensor) -> list[tuple[str, 
     return out
 
 
-def _ends(passage: Passage, source: Tensor, target: Tensor) -> tuple[tuple[str, float], ...]:
+def _ends(passage: Retargeter, source: Tensor, target: Tensor) -> tuple[tuple[str, float], ...]:
     a, b = (
         (pos - hip_middle(passage.joints, pos, which)[:, None]) / pose.hip_height
         for which, (pos, pose) in enumerate(((source, passage.here), (target, passage.there)))
@@ -180,7 +180,7 @@ def _ends(passage: Passage, source: Tensor, target: Tensor) -> tuple[tuple[str, 
 def _slide(
     feet: tuple[Foot, ...],
     contacts: Tensor,
-    worlds: tuple[World, World],
+    worlds: tuple[ClipWorld, ClipWorld],
     scale: Scale,
     fps: float,
 ) -> tuple[tuple[float, float], float]:

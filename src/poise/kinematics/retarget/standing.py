@@ -90,19 +90,19 @@ def facing(left: Tensor, up: Tensor) -> Tensor:
     return matrix_to_quat(torch.stack((torch.linalg.cross(y, up), y, up), -2))
 
 
-class World(NamedTuple):
+class ClipWorld(NamedTuple):
     """A clip's joints: places `(T, J, 3)` m and rotations `(T, J, 4)` wxyz, world."""
 
     pos: Tensor
     quat: Tensor
 
     @staticmethod
-    def of(clip: Clip) -> World:
+    def of(clip: Clip) -> ClipWorld:
         """The world places and rotations of a clip."""
-        return World(*(torch.tensor(x) for x in clip.world()))
+        return ClipWorld(*(torch.tensor(x) for x in clip.world()))
 
 
-def mean_pose(roles: Roles, clip: Clip, world: World) -> Tensor:
+def mean_pose(roles: Roles, clip: Clip, world: ClipWorld) -> Tensor:
     """`(J, 4)` wxyz local, mean over upright frames; standing upright and facing +x.
 
     A joint's mean rotation is the principal eigenvector of the sum of q q^T (Markley et al. 2007).
@@ -140,7 +140,7 @@ def identity() -> Tensor:
     return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
-def hinge_axis(world: World, limb: tuple[int, int, int]) -> Tensor | None:
+def hinge_axis(world: ClipWorld, limb: tuple[int, int, int]) -> Tensor | None:
     """The unit axis `(3)` about which a knee or elbow bends, in the frame of the bone above it.
 
     The mean over frames of upper bone x lower bone, where it is bent; None where the limb is hardly ever
@@ -169,7 +169,7 @@ class Stances:
     tilts: Tensor
 
     @staticmethod
-    def of(world: World | None, fps: float, toes: Mapping[int, Tensor | None]) -> Stances:
+    def of(world: ClipWorld | None, fps: float, toes: Mapping[int, Tensor | None]) -> Stances:
         """The moments in which ankle and toe are low and slow; `toes` in the frames of their feet."""
         rot: dict[int, Tensor] = {}
         tilts = [torch.zeros(0, dtype=torch.float64)]

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from poise.body.topology import subtree
 from poise.kinematics.retarget.common_pose import common_pose
-from poise.kinematics.retarget.passage import Passage
+from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.plant import feet_of, plant, source_contacts
 from poise.kinematics.retarget.retarget_report import RetargetReport, measure
-from poise.kinematics.retarget.standing import World
+from poise.kinematics.retarget.standing import ClipWorld
 from poise.motion import Clip, Roles, Skeleton
 from poise.motion.roles import SIDES, find_roles
 from poise.motion.rotations import (
@@ -83,7 +83,7 @@ def retarget(
     began = time.perf_counter()
     config = config or RetargetConfig()
     target = onto if isinstance(onto, Skeleton) else onto.skeleton
-    world, passage = World.of(clip), Passage.between(clip, onto, mapping, example, config.scale)
+    world, passage = ClipWorld.of(clip), Retargeter.between(clip, onto, mapping, example, config.scale)
     if config.rigid:
         passage = replace(passage, joints=passage.joints.without(config.rigid))
     rot, root = passage.transfer(world, config.share)
@@ -96,7 +96,7 @@ def retarget(
     flat = [unwrap_quats(normalize(rot[:, j])) for j in range(len(target))]
     made = Clip(target, root.numpy(), torch.stack(flat, 1).numpy(), clip.fps, clip.name, clip.cyclic)
     seconds = time.perf_counter() - began
-    worlds = world, World.of(made)
+    worlds = world, ClipWorld.of(made)
     return made, measure(worlds, clip.fps, passage, feet, contacts, seconds)
 
 
@@ -104,7 +104,7 @@ _ARM = ("upper_arm", "forearm", "hand")
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-class Rested(NamedTuple):
+class RestPoseResult(NamedTuple):
     """clip: the same motion on the skeleton with the new rest pose. evidence: from what the pose was
     found, in a sentence without a full stop. turned_deg: how far joints' frames were turned, mean."""
 
@@ -113,7 +113,7 @@ class Rested(NamedTuple):
     turned_deg: float
 
 
-def with_rest_pose(clip: Clip) -> Rested:
+def with_rest_pose(clip: Clip) -> RestPoseResult:
     """The same motion on a skeleton that stands in a T-pose with all rotations at zero.
 
     Every joint stays where it is in every frame; its frame turns. The T-pose faces along -Y, which is
@@ -137,7 +137,7 @@ def with_rest_pose(clip: Clip) -> Rested:
     local += [quat_between(turned[:, p], turned[:, j]) for j, p in enumerate(parents) if p >= 0]
     made = replace(clip, skeleton=_skeleton(clip.skeleton, rot), rot=torch.stack(local, 1).numpy())
     angle = 2 * torch.acos(rot[:, 0].abs().clamp(max=1.0))
-    return Rested(made, common.evidence, math.degrees(float(angle.mean())))
+    return RestPoseResult(made, common.evidence, math.degrees(float(angle.mean())))
 
 
 def _skeleton(skeleton: Skeleton, rot: Tensor) -> Skeleton:

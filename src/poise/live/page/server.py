@@ -20,7 +20,7 @@ from websockets.http11 import Request, Response
 
 from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION, command, parse
-from poise.live.sockets import WAITING, Bucket, Doorway, Guard, pauses
+from poise.live.sockets import WAITING, Bucket, Guard, GuardedSocket, pauses
 from poise.live.sources import Fits, JsonStream
 from poise.live.stream import Inbox
 
@@ -181,7 +181,7 @@ class PageServer:
         self._loop.set_exception_handler(pauses)
         try:
             server: Server = await serve(
-                self._handle, sock=Doorway(guard), backlog=WAITING, process_request=self._answer,
+                self._handle, sock=GuardedSocket(guard), backlog=WAITING, process_request=self._answer,
                 create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
                 open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=60,
                 compression=None, server_header=None, logger=_quiet(),

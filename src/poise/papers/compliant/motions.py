@@ -163,7 +163,7 @@ def motion_of(scene: PlayScene, tracker: Tracker, seconds: float = 8.0) -> Clip 
     """The motion of a scene that has one of its own, else None; a door takes its own time."""
     if isinstance(scene, Chicken):
         return hopping(tracker, seconds, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
-    if isinstance(scene, door.Doorway):
+    if isinstance(scene, door.DoorScene):
         return opening(tracker, min(max(scene.made_for or scene.width, 0.5), 3.0))
     return None
 

@@ -31,7 +31,7 @@ from poise.kinematics import Kinematics
 from poise.machine import one_thread
 from poise.motion.rotations import heading_quat, lateral_heading
 from poise.papers.compliant.motions import AT_SOMEBODY, hopping
-from poise.papers.compliant.scenes import Chicken, Stage
+from poise.papers.compliant.scenes import Chicken, SceneSetup
 from poise.papers.compliant.scenes.body_scenes import RIVAL, weighing
 from poise.recipes.imitation import Imitation
 from poise.sim import Backend, Character, CharacterRows, Drive, displaced
@@ -223,7 +223,7 @@ def weighed(task: Imitation, kg: float, ahead_m: float = 0.0) -> Imitation:
     return replace(task, humanoid=body, reference=moved)
 
 
-def rival_stage(scene: Chicken, tracker: Tracker, stage: Stage) -> tuple[Stage, Imitation]:
+def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[SceneSetup, Imitation]:
     """The stage with the opponent in it, and the opponent's task; its plug-in comes by `opposing`."""
     clip = hopping(tracker, yaw=math.pi, ways=AT_SOMEBODY)
     task = weighed(imitation_of(tracker, [place(clip, tracker)]), scene.other, APART_M)

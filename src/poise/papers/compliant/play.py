@@ -32,8 +32,8 @@ from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.opponents import opposing, rival_stage, weighed
-from poise.papers.compliant.scenes import Chicken, PlayScene
-from poise.papers.compliant.training import Learned, Topped, seen
+from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
+from poise.papers.compliant.training import LearnedOnTop, Topped, seen
 from poise.papers.compliant.watch import Watch, meter_of, words_of
 from poise.plan import LookaheadConfig
 from poise.recipes.imitation import Imitation
@@ -132,7 +132,7 @@ def play(
     seconds: float = 8.0,
     threads: int = 0,
     name: str = "",
-    learned: Learned | None = None,
+    learned: LearnedOnTop | None = None,
     controller: Literal["policy", "lookahead"] = "policy",
     lookahead: LookaheadConfig | None = None,
 ) -> Played:
@@ -193,7 +193,7 @@ def play(
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
     (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
     return Played(
-        name or type(scene).__name__.lower(), {**WORDS, **words_of(scene)}, imitation, evaluation,
+        name or next(k for k, kind in SCENES.items() if kind is type(scene)), {**WORDS, **words_of(scene)}, imitation, evaluation,
         looked.figures(rollouts, task), other.figures(others, task), count,
         tuple(looked.arrows), looked.movers(),
     )  # fmt: skip
@@ -209,7 +209,7 @@ def _episodes(
     task: Imitation,
     count: int,
     threads: int,
-    learned: Learned | None = None,
+    learned: LearnedOnTop | None = None,
     lookahead: LookaheadConfig | None = None,
 ) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
     zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))

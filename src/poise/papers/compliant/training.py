@@ -41,7 +41,7 @@ from poise.learn.policy import policy_in
 from poise.machine import cores, one_thread
 from poise.papers.compliant import imitation_controller as terms
 from poise.papers.compliant.motions import motion_of, standing
-from poise.papers.compliant.scenes import SCENES, PlayScene, Stage
+from poise.papers.compliant.scenes import SCENES, PlayScene, SceneSetup
 from poise.papers.compliant.scenes.ball import FictionalForces
 from poise.recipes.imitation import Imitation
 from poise.settings import Migration, Range, Share, from_data, to_data, validate
@@ -222,14 +222,14 @@ class Compliant:
 LEARNED = ("ball", "door")
 
 
-def seen(stage: Stage) -> tuple[ObsTerm, ...]:
+def seen(stage: SceneSetup) -> tuple[ObsTerm, ...]:
     """What the policy on top sees."""
     own = (obs.root_height, obs.root_tilt, obs.root_velocity)
     u = ObsTerm("displacement", terms.displacement)
     return (*(ObsTerm(f"own/{t.__name__}", t) for t in own), u, *stage.obs)
 
 
-def task(base: TaskConfig, stage: Stage, config: Compliant, rate_hz: float) -> TaskConfig:
+def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float) -> TaskConfig:
     """The task of the policy below, with what the scene adds to it (Eq. 10)."""
     imitation = tuple(replace(r, weight=config.imitation_weight * r.weight) for r in base.rewards)
     own = tuple(replace(r, weight=config.task_weight) for r in stage.rewards)
@@ -257,7 +257,7 @@ SHIPPED = {"ball": Path(__file__).parents[2] / "data" / "ball.safetensors"}
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class LearnedOnTop:
     """What was learned on top of a policy.
 
     Attributes:
@@ -330,7 +330,7 @@ def train(
             trainer.close()
 
 
-def save_learned(learned: Learned, tracker: Tracker, path: Path) -> None:
+def save_learned(learned: LearnedOnTop, tracker: Tracker, path: Path) -> None:
     """Writes what was learned on top of a policy as one file, its matrices in half precision."""
     meta = {
         "kind": "policy", **learned.top.identity(tracker.humanoid.identity),
@@ -349,7 +349,7 @@ def digest_of(policy: PolicyBundle) -> str:
     return told.hexdigest()[:16]
 
 
-def shipped(scene: str, tracker: Tracker) -> Learned | None:
+def shipped(scene: str, tracker: Tracker) -> LearnedOnTop | None:
     """What comes along for a scene; None where there is nothing, or it belongs to another policy."""
     path = SHIPPED.get(scene)
     if path is None or load_checkpoint(path)[1]["metadata"]["below"] != digest_of(tracker.policy):
@@ -357,7 +357,7 @@ def shipped(scene: str, tracker: Tracker) -> Learned | None:
     return open_learned(path, tracker)
 
 
-def open_learned(folder: Path, tracker: Tracker) -> Learned:
+def open_learned(folder: Path, tracker: Tracker) -> LearnedOnTop:
     """What a run has learned so far, or the file that `save_learned` wrote.
 
     Raises:
@@ -383,7 +383,7 @@ def open_learned(folder: Path, tracker: Tracker) -> Learned:
     return _fitting(load_policy(folder / LATEST), config, tracker, folder)
 
 
-def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Path) -> Learned:
+def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Path) -> LearnedOnTop:
     """Refuses what was trained on another body."""
     added = config.added(tracker.policy.num_obs)
     if top.num_actions != added.width(len(tracker.humanoid.hinges)):
@@ -393,7 +393,7 @@ def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Pat
             "Give the policy it was trained on",
             code="bodies-differ",
         )
-    return Learned(config, top, added)
+    return LearnedOnTop(config, top, added)
 
 
 def _read(file: Path) -> Compliant:

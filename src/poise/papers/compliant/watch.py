@@ -22,7 +22,7 @@ from poise.kinematics import lowest_height
 from poise.metrics import success_rule
 from poise.papers.compliant.figures import FALLEN, TOUCHES_N
 from poise.papers.compliant.opponents import Opposing
-from poise.papers.compliant.scenes import Balance, Chicken, Doorway, PlayScene, Trampoline
+from poise.papers.compliant.scenes import Balance, Chicken, DoorScene, PlayScene, TrampolineScene
 from poise.papers.compliant.scenes.ball import COS_45, upright_of
 from poise.papers.compliant.scenes.body_scenes import Bouncing
 from poise.papers.compliant.scenes.door import WANTED, across
@@ -363,7 +363,7 @@ def _off(env: ImitationEnv) -> Tensor:
 
 
 METERS: Mapping[type[PlayScene], Callable[[], Meter]] = {
-    Doorway: DoorMeter, Trampoline: TrampolineMeter, Balance: BallMeter,
+    DoorScene: DoorMeter, TrampolineScene: TrampolineMeter, Balance: BallMeter,
     Chicken: ChickenMeter,
 }  # fmt: skip
 

@@ -230,7 +230,7 @@ def amount(value: Any, unit: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
-class Row(NamedTuple):
+class FigureRow(NamedTuple):
     """One figure of the table: what it is called, its amount and the clip's own, what it means, and
     whether it is "better" or "worse" than the clip's, else ""."""
 
@@ -248,34 +248,34 @@ def _mark(after: float | None, before: float | None) -> str:
     return "better" if after < before else "worse"
 
 
-def score_rows(score: dict[str, Any]) -> list[Row]:
+def score_rows(score: dict[str, Any]) -> list[FigureRow]:
     """The whole score as rows of a table; keys that are not known are listed last as they are."""
     raw = score.get("reference")
     before: dict[str, Any] = raw if isinstance(raw, dict) else {}
     share = number(score.get("succ"))
     rule = str(score.get("succ_rule") or "share of starts that reach the end")
-    rows = [Row("Success", NONE if share is None else percent(share), "", rule)]
+    rows = [FigureRow("Success", NONE if share is None else percent(share), "", rule)]
     if (whole := number(score.get("tracked"))) is not None:
-        rows.append(Row("Tracked", percent(whole), "", "success, upright and on its feet"))
+        rows.append(FigureRow("Tracked", percent(whole), "", "success, upright and on its feet"))
     for key, name, unit, meaning in _ROWS:
         mark = _mark(number(score.get(key)), number(before.get(key)))
         mark = "" if cut(score) and mark == "better" else mark
         beside = amount(before[key], unit) if key in before else ""
-        rows.append(Row(name, amount(score.get(key), unit), beside, meaning, mark))
+        rows.append(FigureRow(name, amount(score.get(key), unit), beside, meaning, mark))
     reward = score.get("reward")
     total = reward.get("total") if isinstance(reward, dict) else reward
     if number(total) is not None:
-        rows.append(Row("Reward", amount(total), "", "mean per step"))
+        rows.append(FigureRow("Reward", amount(total), "", "mean per step"))
     table = score.get("help")
     if isinstance(table, dict):
         known = {key for key, *_ in _HELP_table}
         for key, name, unit, text in _HELP_table:
-            rows.append(Row(f"Help: {name.lower()}", amount(table.get(key), unit), "", text))
-        rows += [Row(f"Help: {key}", amount(v)) for key, v in table.items() if key not in known]
-    rows += [Row(name, amount(score.get(key), unit), "", text) for key, name, unit, text in _RUN]
+            rows.append(FigureRow(f"Help: {name.lower()}", amount(table.get(key), unit), "", text))
+        rows += [FigureRow(f"Help: {key}", amount(v)) for key, v in table.items() if key not in known]
+    rows += [FigureRow(name, amount(score.get(key), unit), "", text) for key, name, unit, text in _RUN]
     listed = _SPECIAL | {key for key, *_ in _ROWS + _RUN}
     rest = {k: v for k, v in score.items() if k not in listed and not isinstance(v, dict | list)}
-    return rows + [Row(str(k), amount(v)) for k, v in rest.items()]
+    return rows + [FigureRow(str(k), amount(v)) for k, v in rest.items()]
 
 
 #: Losses that are named one by one.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import Drawn, InScene
+from poise.env.events import InScene, RandomEvent
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
 from poise.env.plugins import Felt, Plugin
@@ -23,7 +23,7 @@ from poise.env.things import Switch, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
-from poise.papers.compliant.scenes.stage import Given, Stage
+from poise.papers.compliant.scenes.stage import Given, SceneSetup
 from poise.settings import Range, validate
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
 from poise.sim.props import Rod
@@ -71,7 +71,7 @@ class Balance:
     def __post_init__(self) -> None:
         validate(self, "ball")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The rod, its joint on the head, the fictional forces and the task's terms.
 
         Raises:
@@ -105,7 +105,7 @@ class Balance:
         push = Pushes(force, (2.0, 3.0), 0.1, (chest,), rate, self.seed)
         pushes = (push,) if self.pushes else ()
         known = {"head": head, "length": self.length}
-        return Stage(
+        return SceneSetup(
             (top,), (link,), (), (part, *pushes, Fictional(self, head)),
             (ObsTerm("task/ball", ball_seen, known),),
             (RewardTerm("task/above", above, 0.5, known, imitation=False),),
@@ -139,7 +139,7 @@ class Tilted:
         return _Tilted(self, sim)
 
 
-class _Tilted(Drawn):
+class _Tilted(RandomEvent):
     def __init__(self, event: Tilted, sim: SceneSim):
         super().__init__(event.seed)
         self._event, self._sim = event, sim

@@ -20,7 +20,7 @@ from poise.env.pushes import Push
 from poise.env.reference import Reference
 from poise.env.things import Move, SetDown, Switch, Throw, always
 from poise.errors import PoiseError
-from poise.papers.compliant.scenes.stage import Given, Stage, as_given, hand_of
+from poise.papers.compliant.scenes.stage import Given, SceneSetup, as_given, hand_of
 from poise.settings import Range, validate
 from poise.sim import Link, Plane, SceneSim, Touch
 from poise.sim.props import Ball, Box, Carrier
@@ -28,7 +28,7 @@ from poise.sim.props import Trampoline as Plate
 
 
 @dataclass(frozen=True)
-class Hands:
+class HandInHand:
     """A partner's hand on a straight way beside the character, joined to its hand by a ball joint.
 
     The partner is not simulated: its hand goes as fast as the motion goes on average, and `lead` faster,
@@ -49,7 +49,7 @@ class Hands:
     def __post_init__(self) -> None:
         validate(self, "hands")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The partner's hand where the character's is at first, and the link; its force is felt."""
         row = hand_of(humanoid, self.side, "hands")
         frames, pose = int(reference.length[0]), reference.pose
@@ -67,7 +67,7 @@ class Hands:
             felt=("hands",),
             events=(Move(name, self._path(velocity, ahead)), Switch("hands", always)),
         )
-        return Stage((prop,), (Link("hands", name, body, "ball", measured=True),), (), (part,))
+        return SceneSetup((prop,), (Link("hands", name, body, "ball", measured=True),), (), (part,))
 
     def _path(self, velocity: Tensor, ahead: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
         w = 2.0 * math.pi / self.every_s
@@ -112,18 +112,20 @@ class Chicken:
     def __post_init__(self) -> None:
         validate(self, "chicken")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The bag, its throws and all touches with it; of a rival the touches alone."""
         name = "bag" if self.against == "bag" else RIVAL
         touches = touches_of("felt", name, humanoid.bodies)
         felt = tuple(t.name for t in touches)
         if self.against == "rival":
-            return Stage((), (), touches, (InScene(felt=felt),), from_start=True)
+            return SceneSetup((), (), touches, (InScene(felt=felt),), from_start=True)
         chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
         bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other)
-        return Stage((bag,), (), touches, (InScene(felt=felt, events=(far, throw)),), from_start=True)
+        return SceneSetup(
+            (bag,), (), touches, (InScene(felt=felt, events=(far, throw)),), from_start=True
+        )
 
 
 def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
@@ -143,7 +145,7 @@ def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
 
 
 @dataclass(frozen=True)
-class Pull:
+class PullScene:
     """A constant force at one hand.
 
     Attributes:
@@ -165,14 +167,14 @@ class Pull:
         if not any(self.direction):
             raise PoiseError("a pull needs a direction, got three times 0", "pull", code="out-of-range")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The force at the hand's centre of mass."""
         row = hand_of(humanoid, self.side, "pull")
         unit = np.asarray(self.direction) / np.linalg.norm(self.direction)
         x, y, z = (float(self.newtons * v) for v in unit)
         rate = reference.rate_hz
         steps = max(1, round(self.lasts_s * rate))
-        return Stage(plugins=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
+        return SceneSetup(plugins=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ class Throws:
     def __post_init__(self) -> None:
         validate(self, "throws")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """A ball that waits far off, touches of each body, and throws; "hit" is metered."""
         chest = (humanoid.rows_of("spine") or (0,))[-1]
         touches = touches_of("felt", "ball", humanoid.bodies)
@@ -207,7 +209,7 @@ class Throws:
                 Throw("ball", humanoid.bodies[chest], self.speed, every_s=self.every_s, seed=self.seed),
             ),
         )
-        return Stage((Ball(mass=self.mass),), (), (*touches, hit), (part,))
+        return SceneSetup((Ball(mass=self.mass),), (), (*touches, hit), (part,))
 
 
 #: s from bounce to bounce, and from a contact on for which the character gives way.
@@ -219,7 +221,7 @@ BELOW_M = -1.0
 
 
 @dataclass(frozen=True)
-class Trampoline:
+class TrampolineScene:
     """A rigid plate on four linear actuators, which throws the character up every 3 s.
 
     Contacts of the feet are given way to for 1 s after the feet have come down again.
@@ -235,7 +237,7 @@ class Trampoline:
     def __post_init__(self) -> None:
         validate(self, "trampoline")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The plate in place of the floor, its bounces, and the feet's contacts."""
         # In the middle of what the motion crosses.
         low, high = torch.aminmax(reference.pose.pos[:, 0, :2], dim=0)
@@ -249,7 +251,7 @@ class Trampoline:
             sees=(plate.name,), felt=names, felt_part=dict.fromkeys(names, after_contact),
             events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
         )  # fmt: skip
-        return Stage((plate,), (), touches, (part,), from_start=True,
+        return SceneSetup((plate,), (), touches, (part,), from_start=True,
                      floor=Plane(BELOW_M), yields=stands_still)  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from poise.env.reference import Reference
 from poise.env.things import SetDown
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
-from poise.papers.compliant.scenes.stage import Stage, hand_of
+from poise.papers.compliant.scenes.stage import SceneSetup, hand_of
 from poise.settings import Range, validate
 from poise.sim import Link, SceneSim
 from poise.sim.props import Door
@@ -38,7 +38,7 @@ AHEAD_M = 0.06
 
 
 @dataclass(frozen=True)
-class Doorway:
+class DoorScene:
     """A door in front of the character, and a weld of its left hand and the knob while it opens it.
 
     The motion faces +X. Doors of all widths have their knob where the hand comes to; the hinge is on the
@@ -58,7 +58,7 @@ class Doorway:
     def __post_init__(self) -> None:
         validate(self, "door")
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The door, the weld and the task's terms.
 
         Raises:
@@ -89,7 +89,7 @@ class Doorway:
             events=(SetDown(door.name, (0.0,)), Grip(humanoid.bodies[row], door)),
         )  # fmt: skip
         knob = torch.tensor(door.knob)
-        return Stage(
+        return SceneSetup(
             (door,), (link,), (), (part,),
             (ObsTerm("task/phase", phase), ObsTerm("task/knob", knob_seen, {"row": row, "knob": knob})),
             (RewardTerm("task/open", opened, 0.5, imitation=False),),

@@ -23,7 +23,7 @@ def as_given(given: Given | None) -> Given:
     return given or Compliance()
 
 
-class Stage(NamedTuple):
+class SceneSetup(NamedTuple):
     """What stands in each world beside one character, and what happens to it.
 
     Attributes:
@@ -50,7 +50,7 @@ class Stage(NamedTuple):
 class PlayScene(Protocol):
     """The settings of a scene, one file each."""
 
-    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+    def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """What it takes for a body and the motion that it follows.
 
         Raises:
