@@ -192,8 +192,9 @@ def play(
         ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
     (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
+    called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
     return Played(
-        name or next(k for k, kind in SCENES.items() if kind is type(scene)), {**WORDS, **words_of(scene)}, imitation, evaluation,
+        called, {**WORDS, **words_of(scene)}, imitation, evaluation,
         looked.figures(rollouts, task), other.figures(others, task), count,
         tuple(looked.arrows), looked.movers(),
     )  # fmt: skip
