@@ -291,7 +291,7 @@ def _parts() -> dict[str, str]:
     return out
 
 
-_PARTS_vrm = _parts()
+_VRM_PARTS = _parts()
 
 
 def humanoid_of(file: GltfFile, tree: Tree, joints: Sequence[int]) -> dict[int, str]:
@@ -301,7 +301,7 @@ def humanoid_of(file: GltfFile, tree: Tree, joints: Sequence[int]) -> dict[int, 
     """
     out: dict[int, str] = {}
     for bone, node in _bones(file.doc):
-        role = _PARTS_vrm.get(bone)
+        role = _VRM_PARTS.get(bone)
         known = isinstance(node, int) and not isinstance(node, bool) and node in joints
         if role is not None and known and role not in out.values():
             out.setdefault(joints.index(node), role)

@@ -187,7 +187,7 @@ def layout_of_joints(skeleton: Skeleton) -> SmplLayout | None:
 
 _POSES = ("poses", "smpl_poses", "pose_aa", "fullpose", "pose_world")
 _ROOT = ("root_orient", "global_orient")
-_BODY_smpl = ("pose_body", "body_pose")
+_SMPL_BODY = ("pose_body", "body_pose")
 _TRANS = ("trans", "smpl_trans", "transl", "trans_world")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "framerate", "fps")
 _JOINTS = ("rest_joints", "J", "joints")
@@ -208,7 +208,7 @@ def to_y_up(up: str) -> torch.Tensor:
 def is_smpl(keys: Mapping[str, Any] | Sequence[str]) -> bool:
     """Whether arrays of these names are a motion of the SMPL family."""
     return _first(keys, _POSES) is not None or (
-        _first(keys, _ROOT) is not None and _first(keys, _BODY_smpl) is not None
+        _first(keys, _ROOT) is not None and _first(keys, _SMPL_BODY) is not None
     )
 
 
@@ -340,7 +340,7 @@ def _parts(data: Mapping[str, Any], path: Path) -> np.ndarray:
         value = np.asarray(data[key])
         return numeric({key: _flat(value)}, key, (None, None), path)
 
-    body = [part(*_ROOT), part(*_BODY_smpl)]
+    body = [part(*_ROOT), part(*_SMPL_BODY)]
     left, right = part("left_hand_pose"), part("right_hand_pose")
     hands = part("pose_hand", "hand_pose")
     if hands is None and left is not None and right is not None:

@@ -162,7 +162,7 @@ def _fill(module: nn.Module, hidden: int, generator: torch.Generator) -> None:
             p.uniform_(-(hidden**-0.5), hidden**-0.5, generator=generator)
 
 
-_MIN_STD_cosine_cvae = 1e-3
+_LEAST_COSINE_STD = 1e-3
 #: Frames in which a velocity that is left to itself dies down, and in which cosines set in.
 _FADE, _RAMP = 4.0, 10.0
 #: Between which the logarithm of a code's variance stays.
@@ -210,7 +210,7 @@ class CosineCVAE(nn.Module):
     def calibrate(self, frames: Tensor) -> None:
         """Takes the scale of every number from frames `(F, D)`."""
         self.mean.copy_(frames.mean(0))
-        self.std.copy_(frames.std(0).clamp_min(_MIN_STD_cosine_cvae))
+        self.std.copy_(frames.std(0).clamp_min(_LEAST_COSINE_STD))
 
     def scaled(self, frames: Tensor) -> Tensor:
         """Frames in deviations from the mean."""

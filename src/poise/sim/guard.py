@@ -20,7 +20,7 @@ from poise.errors import PoiseError
 from poise.sim.backend import Backend
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-_HUGE = 1e10  # MuJoCo's mjMAXVAL.
+_HUGE = 1e10  # MuJoCo's mjMAXVAL, above which it calls a position bad.
 _ROTARY = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 
 
@@ -152,10 +152,6 @@ def _speed_unit(model: mujoco.MjModel, dof: int) -> str:
     return "rad/s" if turns or kind in _ROTARY else "m/s"
 
 
-_STATE_guard = mujoco.mjtState.mjSTATE_INTEGRATION
-_HUGE_guard = 1e10  # MuJoCo's mjMAXVAL, above which it calls a position bad.
-
-
 @dataclass(frozen=True)
 class Failure:
     """One world that went bad.
@@ -252,9 +248,9 @@ class NanGuard:
         flagged = self.backend.unstable()
         # One NaN or infinity makes the sum one.
         sane = math.isfinite(float(self._before.sum())) and not bool(flagged.any())
-        if sane and self._within(qpos, _HUGE_guard) and self._within(qvel, self.speed_limit):
+        if sane and self._within(qpos, _HUGE) and self._within(qvel, self.speed_limit):
             return []
-        good = (qpos.abs() < _HUGE_guard).all(1) & (qvel.abs() < self.speed_limit).all(1)
+        good = (qpos.abs() < _HUGE).all(1) & (qvel.abs() < self.speed_limit).all(1)
         good &= self._before.isfinite().all(1)
         return torch.nonzero(flagged | ~good)[:, 0].tolist()
 
@@ -330,11 +326,11 @@ def replay_dump(path: str | Path) -> Replay:
     model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": model_bytes})
     nstep = int(info["nstep"])
     data, again = mujoco.MjData(model), np.empty_like(after)
-    mujoco.mj_setState(model, data, before, _STATE_guard)
+    mujoco.mj_setState(model, data, before, _STATE)
     mujoco.mj_step(model, data, nstep)
-    mujoco.mj_getState(model, data, again, _STATE_guard)
+    mujoco.mj_getState(model, data, again, _STATE)
     mujoco.mj_resetData(model, data)
-    mujoco.mj_setState(model, data, before, _STATE_guard)
+    mujoco.mj_setState(model, data, before, _STATE)
     cause = diagnose(model, before, nstep, float(info["speed_limit"]))
     failure = Failure(info["env"], info["step"], info["where"], cause, path)
     exact = bool(np.array_equal(again, after, equal_nan=True))
@@ -343,8 +339,8 @@ def replay_dump(path: str | Path) -> Replay:
 
 def _integration_state(backend: Backend, env: int) -> np.ndarray:
     model = backend.model
-    state = np.empty(mujoco.mj_stateSize(model, _STATE_guard))
-    mujoco.mj_getState(model, backend.get_data(env), state, _STATE_guard)
+    state = np.empty(mujoco.mj_stateSize(model, _STATE))
+    mujoco.mj_getState(model, backend.get_data(env), state, _STATE)
     return state
 
 

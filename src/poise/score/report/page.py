@@ -193,7 +193,7 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
     ("float_mm", "Floating", "mm", "how far the body hovers where it should touch"),
     ("jerk", "Jerk", "m/s³", "change of acceleration; smoother motion has less"),
 )
-_HELP_table: tuple[tuple[str, str, str, str], ...] = (
+_TABLE_HELP: tuple[tuple[str, str, str, str], ...] = (
     ("limit_n", "Force limit", "N", "the most the residual force may give"),
     ("limit_nm", "Torque limit", "N m", "the most the residual torque may give"),
     ("force_mean_n", "Force, mean", "N", "what it did give"),
@@ -268,8 +268,8 @@ def score_rows(score: dict[str, Any]) -> list[FigureRow]:
         rows.append(FigureRow("Reward", amount(total), "", "mean per step"))
     table = score.get("help")
     if isinstance(table, dict):
-        known = {key for key, *_ in _HELP_table}
-        for key, name, unit, text in _HELP_table:
+        known = {key for key, *_ in _TABLE_HELP}
+        for key, name, unit, text in _TABLE_HELP:
             rows.append(FigureRow(f"Help: {name.lower()}", amount(table.get(key), unit), "", text))
         rows += [FigureRow(f"Help: {key}", amount(v)) for key, v in table.items() if key not in known]
     rows += [FigureRow(name, amount(score.get(key), unit), "", text) for key, name, unit, text in _RUN]

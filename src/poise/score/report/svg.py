@@ -261,7 +261,7 @@ def _labels(
     return "".join(out)
 
 
-_STYLE_poses = """<style>
+_POSES_STYLE = """<style>
 .pf{font:13px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",sans-serif}
 .pf .bg{fill:#fff}.pf text{fill:#667080}.pf .t{fill:#1d2129;font-size:15px;font-weight:600}
 .pf .floor{stroke:#c9ccd2}.pf .key{stroke:#1d2129}.pf path{fill:none;stroke-width:1.7;
@@ -322,7 +322,7 @@ def pose_rows(
     out = [
         f'<svg class="pf" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" '
         f'width="{width:g}" height="{height:g}" role="img" aria-label="{escape(title, quote=True)}">',
-        _STYLE_poses, '<rect class="bg" width="100%" height="100%" rx="10"/>',
+        _POSES_STYLE, '<rect class="bg" width="100%" height="100%" rx="10"/>',
         f'<text class="t" x="16" y="26">{escape(title)}</text>',
     ]  # fmt: skip
     tall = max(float(row.pos[list(frames), :, 2].max()) for row in rows)
