@@ -261,7 +261,8 @@ def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
     first = decode(lines[0] if lines else b"", path, 1)
     if not first.startswith(CSV_MARK):
         raise PoiseError(
-            f"it is no table of keypoints and no CSV of Poise, which begins with '{CSV_MARK} {CSV_VERSION}'",
+            "it is no table of keypoints and no CSV of Poise, which begins with "
+            f"'{CSV_MARK} {CSV_VERSION}'",
             path,
             "Name the columns of keypoints NAME_x, NAME_y, NAME_z",
             code="wrong-format",
@@ -269,7 +270,8 @@ def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
     version = first.removeprefix(CSV_MARK).strip(" ,\t")
     if version != str(CSV_VERSION):
         raise PoiseError(
-            f"the file has version {shown(version)} of Poise's CSV; this Poise reads version {CSV_VERSION}",
+            f"the file has version {shown(version)} of Poise's CSV; "
+            f"this Poise reads version {CSV_VERSION}",
             at_line(path, 1),
             code="version-unsupported",
         )
