@@ -41,7 +41,7 @@ EXPLAINED = {
         "jobs/imitate.py:imitate", "score/card.py:read_score", "env/faces.py:GymVectorEnv",
         "env/faces.py:GymEnv", "env/faces.py:RslRlVecEnv",
         "formats/smpl.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
-        "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
+        "sim/guard.py:replay_dump", "sim/floor.py:HeightField", "sim/floor.py:Steps",
         "sim/props.py:Lift",
         "papers/compliant/opponents.py:Teams", "papers/compliant/training.py:save_learned",
     ),
