@@ -355,12 +355,12 @@ def test_columns_of_a_body() -> None:
 @pytest.mark.parametrize(
     ("given", "what"),
     [
-        (lambda: Compliance(level=1.2), "must lie in 0 to 1, got 1.2. Above 1 it would run away"),
+        (lambda: Compliance(level=1.2), ("out-of-range", "1.2")),
         (lambda: Compliance(level=-0.1), ("out-of-range", "-0.1")),
-        (lambda: Compliance(law="eq9"), "law cannot be.*eq8, algorithm1"),  # type: ignore[arg-type]
-        (lambda: Compliance(weighting="both"), "weighting cannot be.*inverse, printed"),  # type: ignore[arg-type]
-        (lambda: Compliance(axes=(1.0, 2.0, 1.0)), "axes must lie in 0 to 1"),
-        (lambda: Compliance(weights=(("thigh", 0.0),)), "weights must be above 0"),
+        (lambda: Compliance(law="eq9"), ("unknown-choice", "law")),  # type: ignore[arg-type]
+        (lambda: Compliance(weighting="both"), ("unknown-choice", "weighting")),  # type: ignore[arg-type]
+        (lambda: Compliance(axes=(1.0, 2.0, 1.0)), ("out-of-range", "axes")),
+        (lambda: Compliance(weights=(("thigh", 0.0),)), ("out-of-range", "weights")),
         (lambda: Compliance(return_hz=0.0), ("out-of-range", "return_hz")),
         (lambda: Stiffness(0.0), ("out-of-range", "N/m")),
         (lambda: Stiffness(lag_s=0.0), ("out-of-range", "lag_s")),

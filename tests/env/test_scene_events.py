@@ -273,7 +273,7 @@ def test_mistakes(task: Imitation) -> None:
             env_in(task, sim, InScene(events=(event,)))
     with refused("no-bodies"):
         env_in(task, sim, InScene(sees=("others",)))
-    with refused("not-rising", says="speed"):
+    with refused("out-of-range", says="speed"):
         Throw("ball", "anna/Chest", speed=(3.0, 2.0))
     part = replace(task.task, plugins=(InScene(),))
     with refused("scene-needed"):

@@ -32,7 +32,7 @@ FITTED = ("a.trc", "a.csv", "keys.npz", "joints.npy", "mdm.npy")
 
 def seeds(folder: Path) -> list[Seed]:
     """All seeds; `folder` is worked in."""
-    beside = (_TESTS / "motion", _TESTS, _TESTS / "body", _TESTS.parent / "benchmarks")
+    beside = (_TESTS / "formats", _TESTS, _TESTS / "body", _TESTS.parent / "benchmarks")
     sys.path += [str(p) for p in beside if str(p) not in sys.path]
     import handmade_motion_files as motion
     import handmade_numpy_files as arrays

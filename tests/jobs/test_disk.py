@@ -33,7 +33,7 @@ import torch
 from poise.cli.main import main
 from poise.errors import PoiseError
 from poise.learn import load_checkpoint, save_checkpoint
-from poise.motion import read_clip, write_clip
+from poise.formats import read_clip, write_clip
 walk, folder = Path(sys.argv[1]), Path(sys.argv[2])
 clip = read_clip(walk)
 names = ["a.bvh", "a.npz", "a.csv", "a.glb", "a.gltf"]

@@ -202,7 +202,7 @@ sys.exit(os.WEXITSTATUS(status))
 @pytest.mark.parametrize("every", [1, 4])
 def test_kills_at_random_moments_change_nothing(every, tmp_path):
     here = str(Path(__file__).parent)
-    paths = [here, *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [here, str(Path(here).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     seed = str(random.randrange(10**6))
     command = [sys.executable, "-c", KILLER, str(tmp_path / "killed"), seed, str(every)]

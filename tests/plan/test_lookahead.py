@@ -227,8 +227,8 @@ def test_prices_by_hand() -> None:
         ({"candidates": 3}, ("budget-too-small", "10")),
         ({"hold_steps": 20}, ("out-of-range", "hold_steps")),
         ({"noise_range": (0.3, 0.1)}, ("out-of-range", "noise_range")),
-        ({"smoothing": (1.0,)}, "smoothing must be at least 0 and below 1"),
-        ({"slack": -1.0}, ("out-of-range", "prices")),
+        ({"smoothing": (1.0,)}, ("out-of-range", "smoothing")),
+        ({"slack": -1.0}, ("out-of-range", "slack")),
     ],
 )
 def test_settings_that_make_no_sense(settings: dict, words: tuple) -> None:

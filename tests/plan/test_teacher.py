@@ -71,10 +71,10 @@ def test_labels_cost_less_than_what_the_learner_does(task: Imitation) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"best": 32}, "best must be fewer than candidates"),
+        ({"best": 32}, ("out-of-range", "best")),
         ({"hold_steps": 9}, ("out-of-range", "hold_steps")),
         ({"noise_range": (0.0, 0.1)}, ("out-of-range", "noise_range")),
-        ({"jerk_price": -1.0}, ("out-of-range", "prices")),
+        ({"jerk_price": -1.0}, ("out-of-range", "jerk_price")),
     ],
 )
 def test_settings_that_make_no_sense(settings: dict, words: tuple) -> None:

@@ -113,8 +113,8 @@ def test_evaluations_count_clips_with_noise_as_clips(imitation: Imitation) -> No
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"noise": (0.0,)}, "noise must be above 0"),
-        ({"noise": (0.5, 0.5)}, "different strengths"),
+        ({"noise": (0.0,)}, ("out-of-range", "noise")),
+        ({"noise": (0.5, 0.5)}, ("out-of-range", "noise")),
         (
             {"noise": (0.5,), "shape": True, "shapes": BodyShapes(count=2)},
             ("settings-conflict", "noise"),

@@ -140,5 +140,5 @@ def test_scenes_that_are_not_learned(
 ) -> None:
     assert main(["train", "compliant", scene, "-o", str(tmp_path / "run")]) == 2
     assert what in capsys.readouterr().err and not (tmp_path / "run").exists()
-    with refused("out-of-range", says="reach"):
+    with refused("settings-conflict", says="reach"):
         Compliant(scene="door")
