@@ -25,7 +25,7 @@ from tables import TABLES, Results, markdown  # noqa: E402
 
 MARK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-#: What the API page shows, in its order: a title, a package, its names.
+#: Parts of the API page, in its order: a title, a package, its names.
 SHOWN: tuple[tuple[str, str, str], ...] = (
     ("Verbs", "poise", "read write track imitate push inbetween complete dream open_run"),
     ("Results", "poise", "Tracked Imitated Completed Inbetweened Dreamt Run PoiseError"),
@@ -95,7 +95,7 @@ def _anchor(title: str, table: str, shared: set[str]) -> str:
 
 
 def _parser(verb: str) -> tuple[str, dict[str, str]]:
-    """What a verb does, and its groups of options as markdown tables, by title."""
+    """The summary of a verb, and its groups of options as markdown tables, by title."""
     import tyro
 
     from poise.cli import parse
@@ -266,7 +266,7 @@ def packages() -> str:
 
 
 def formats() -> str:
-    """What is read and written, from the table of readers and writers."""
+    """The formats, from the table of readers and writers."""
     from poise.formats import READERS, WRITERS
 
     refused = ("ASF", "robot", "OpenPose")
@@ -304,7 +304,7 @@ def verdicts() -> str:
 
 
 def shipped() -> str:
-    """What comes along: the policies and networks, with what they learned from."""
+    """The policies and networks that come along, with the motion that they learned from."""
     from poise.jobs.open import open_run
 
     results = Results.read()

@@ -1,4 +1,4 @@
-"""Which rows of `results/` stand in which table of the documents, and how they are written.
+"""The documents' tables: their rows of `results/`, and how they are written.
 
 A cell is looked up by suite, subject and metric. A row of a policy that does not ship says so.
 """

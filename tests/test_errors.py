@@ -69,8 +69,11 @@ def test_a_code_is_kept_by_whatever_passes_an_error_on(tmp_path: Path) -> None:
     for again in (copy.copy(error), pickle.loads(pickle.dumps(error))):
         assert type(again) is PoiseError and str(again) == str(error)
         assert (again.code, again.what, again.where, again.hint) == (
-            "no-frames", "has no frames", "a.bvh, line 3", "Add some",
-        )  # fmt: skip
+            "no-frames",
+            "has no frames",
+            "a.bvh, line 3",
+            "Add some",
+        )
     assert brief(error, tmp_path / "a.bvh").code == "no-frames"
     hot = pickle.loads(pickle.dumps(TrainingError("x", code="training-diverged")))
     assert type(hot) is TrainingError and hot.code == "training-diverged"

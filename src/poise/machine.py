@@ -1,4 +1,4 @@
-"""What differs between systems: how many cores there are, and how torch uses them while worlds step."""
+"""Differences between systems: how many cores there are, and how torch uses them while worlds step."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ NONE = "none"
 
 @dataclass(frozen=True)
 class Migration:
-    """What settings of earlier versions are called now.
+    """The present names of settings of earlier versions.
 
     keys: dotted names of then to dotted names of now; a value moves with its key. values: by the new
     dotted name, what a value of then is called now. absent: what a run did that does not name a setting,
@@ -152,7 +152,7 @@ class Range:
             )
 
     def __str__(self) -> str:
-        """What a number must do, as behind "must"."""
+        """The range in words that follow "must"."""
         unit = f" {self.unit}" if self.unit else ""
         low = f"{'above' if self.above else 'at least'} {self.low:g}"
         high = f"{'below' if self.below else 'at most'} {self.high:g}"
@@ -173,7 +173,7 @@ class Length:
     high: float = math.inf
 
     def __str__(self) -> str:
-        """What a field must do, as behind "must"."""
+        """The length in words that follow "must"."""
         many = self.low if math.isinf(self.high) else self.high
         how = "" if self.low == self.high else "at least " if math.isinf(self.high) else "at most "
         how = f"{self.low} to " if how == "at most " and self.low else how
@@ -228,7 +228,7 @@ def validate(config: Any, where: str | None = None) -> None:
 
 @dataclass(frozen=True)
 class _Declared:
-    """What one field of a dataclass declares.
+    """The declaration of one field of a dataclass.
 
     Attributes:
         choices: of a `Literal`; () where anything goes.
@@ -249,7 +249,7 @@ class _Declared:
     listed: bool
 
     def refuses(self, value: Any) -> str:
-        """What is wrong with a value, "" where it is right."""
+        """The fault of a value in words, "" for a right one."""
         if self.choices:
             return "" if value in self.choices else f"cannot be {_short(value)}"
         if self.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
@@ -277,7 +277,7 @@ class _Declared:
         return ""
 
     def hint(self, value: Any) -> str | None:
-        """What to do about a value that is refused."""
+        """The hint for a value that is refused."""
         if self.choices:
             return did_you_mean(str(value)[:40], [str(c) for c in self.choices])
         return (self.range.hint if self.range else "") or None
@@ -296,8 +296,8 @@ class _Declared:
 
 @cache
 def _declared(kind: type) -> tuple[tuple[_Declared, str, float, float], ...]:
-    """What the fields of a dataclass declare, but for those that may be anything: each with its name and
-    the limits of a plain number."""
+    """Declarations of the fields of a dataclass, but for those that may be anything: each with its
+    name and the limits of a plain number."""
     # Settings of other modules check themselves; they need not be imported for this.
     others = {place.partition(":")[2]: object for place in _places(kind)}
     hints = get_type_hints(kind, localns=others or None, include_extras=True)
@@ -315,7 +315,7 @@ def _declared(kind: type) -> tuple[tuple[_Declared, str, float, float], ...]:
         one = _Declared(
             f.name, choices, range_, length, inner, NoneType in leaves, own <= {float, int}, listed
         )
-        # Where a plain number is not enough, no number lies between the limits.
+        # No number lies between the limits of a field that needs more than a plain number.
         plain = range_ is not None and not (listed or choices or f.name == "seed")
         low, high = range_.limits if range_ is not None and plain else (math.inf, -math.inf)
         out.append((one, f.name, low, high))
@@ -459,7 +459,7 @@ def part(place: str, /, made: bool = True, **values: Any) -> Any:
 
 
 def imported(place: str) -> Any:
-    """What stands in a module, "poise.learn:PPOConfig"."""
+    """The object at a place in a module, "poise.learn:PPOConfig"."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
 
@@ -472,7 +472,7 @@ def _types(kind: type) -> dict[str, Any]:
 
 
 def _places(kind: type) -> list[str]:
-    """Where the settings of other modules in a dataclass stand, see `part`."""
+    """The places of settings of other modules in a dataclass, see `part`."""
     own: dict[str, Field[Any]] = getattr(kind, "__dataclass_fields__", {})
     return [f.metadata["place"] for f in own.values() if "place" in f.metadata]
 

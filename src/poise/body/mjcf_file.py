@@ -1,4 +1,4 @@
-"""What MuJoCo compiles of an MJCF file; a script of its own, see `formats.limited`."""
+"""A process of its own compiles an MJCF file with MuJoCo; a script, see `formats.limited`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which joint is which part of a human body, by name and by place in the tree."""
+"""Parts of a human body, told from names and from the tree of joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `imitate` and `train` share: check, read, build, train, the learning curve meanwhile."""
+"""Steps that `imitate` and `train` share: check, read, build, train, the learning curve meanwhile."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def left(seconds: float, share: float) -> str:
 
 
 def figures(stats: IterationStats) -> str:
-    """What one iteration says about the learning."""
+    """An iteration in a line."""
     reward = stats.terms.get("imitation", stats.reward)
     # Nothing is known about episodes before the first one has ended.
     ended = (
@@ -145,7 +145,7 @@ def refuse_held(out: Path, run_file: str, training: Training) -> None:
 
 
 class Trained(Protocol):
-    """What a training says of itself in the end."""
+    """The last lines of a training."""
 
     @property
     def seconds(self) -> float: ...
@@ -217,7 +217,7 @@ def beginning(
 
 
 class Shown:
-    """What is shown while a motion is learned, one bar at a time: see `jobs.practice.Watching`.
+    """Progress while a motion is learned, one bar at a time: see `jobs.practice.Watching`.
 
     clips: the files that are read. out: the folder that is named where `run` is there already.
     """

@@ -287,8 +287,10 @@ class SuccessHelp:
     def __post_init__(self) -> None:
         validate(self)
         if not 0 < self.raise_at < self.lower_at <= 1:
-            raise PoiseError(f"success must satisfy 0 < raise_at {self.raise_at} < lower_at "
-                             f"{self.lower_at} <= 1", code="not-rising")  # fmt: skip
+            raise PoiseError(
+                f"success must satisfy 0 < raise_at {self.raise_at} < lower_at {self.lower_at} <= 1",
+                code="not-rising",
+            )
 
     def scale(self, scale: float, steps: int, success: float) -> float:
         """One notch down, up, or none."""

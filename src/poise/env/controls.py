@@ -1,4 +1,4 @@
-"""What drives the characters in a control step: actions, filtered, with help and plug-ins' forces."""
+"""Forces and targets of a control step: actions, filtered, with help and plug-ins' forces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a term sees: the simulated and the reference character at one control step, by name."""
+"""The view of a term: the simulated and the reference character at one control step, by name."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What N characters are to do, told as it goes; and clips as goals."""
+"""Goals tell N characters their motion as it goes; and clips as goals."""
 
 from __future__ import annotations
 

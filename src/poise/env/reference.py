@@ -110,9 +110,15 @@ class Poser:
             bodies = (x[1:].reshape(count, n, -1) for x in (data.xpos, data.xquat, data.cvel))
             at_pos, at_quat, at_cvel = bodies
             self._made[count] = (
-                model, data, data.qpos.reshape(count, -1), data.qvel.reshape(count, -1), at_pos, at_quat,
-                data.subtree_com[1::n], at_cvel,
-            )  # fmt: skip
+                model,
+                data,
+                data.qpos.reshape(count, -1),
+                data.qvel.reshape(count, -1),
+                at_pos,
+                at_quat,
+                data.subtree_com[1::n],
+                at_cvel,
+            )
         return self._made[count]
 
     def local(self, qpos: Tensor) -> Tensor:

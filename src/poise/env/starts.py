@@ -1,4 +1,4 @@
-"""Where episodes begin: which clip, and which of its frames."""
+"""Starts of episodes: a clip, and one of its frames."""
 
 from __future__ import annotations
 

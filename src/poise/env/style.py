@@ -1,4 +1,4 @@
-"""What a motion prior learns from: frames of the clips, seen as it sees the characters."""
+"""Data of a motion prior: frames of the clips, seen as it sees the characters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a task is made of, what one of its control steps gives, what an environment holds for it."""
+"""A task's parts, the result of one of its control steps, and the parts an environment makes for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ezc3d reads of a C3D file; a script of its own, see `formats.limited`."""
+"""A process of its own reads a C3D file with ezc3d; a script, see `formats.limited`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ufbx reads of an FBX file; a script of its own, see `formats.limited`."""
+"""A process of its own reads an FBX file with ufbx; a script, see `formats.limited`."""
 
 from __future__ import annotations
 

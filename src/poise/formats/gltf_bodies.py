@@ -1,4 +1,4 @@
-"""Which nodes of a glTF file are the joints of one body: of its skins, of what is animated, of VRM."""
+"""The nodes of a glTF file that are joints of one body: of its skins, of its animation, of VRM."""
 
 from __future__ import annotations
 
@@ -273,9 +273,15 @@ def _parents_first(tree: Tree, order: Sequence[int], root: int) -> bool:
 #: Where VRM 1.0, motions of VRM (.vrma) and VRM 0.x hold their humanoid.
 _PLACES = ("VRMC_vrm", "VRMC_vrm_animation", "VRM")
 _SIDED = {
-    "Shoulder": "clavicle", "UpperArm": "upper_arm", "LowerArm": "forearm", "Hand": "hand",
-    "UpperLeg": "thigh", "LowerLeg": "shin", "Foot": "foot", "Toes": "toes",
-}  # fmt: skip
+    "Shoulder": "clavicle",
+    "UpperArm": "upper_arm",
+    "LowerArm": "forearm",
+    "Hand": "hand",
+    "UpperLeg": "thigh",
+    "LowerLeg": "shin",
+    "Foot": "foot",
+    "Toes": "toes",
+}
 _FINGERS = {"Index": "index", "Middle": "middle", "Ring": "ring", "Little": "pinky"}
 _SEGMENTS = ("Proximal", "Intermediate", "Distal")
 

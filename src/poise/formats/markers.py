@@ -1,4 +1,4 @@
-"""Which keypoint is which place of a body, by its label; joint centres from surface markers."""
+"""Keypoints named by their labels as places of a body; joint centres from surface markers."""
 
 from __future__ import annotations
 
@@ -102,8 +102,11 @@ def unknown_labels(labels: Sequence[str]) -> list[str]:
     """The labels that tell no place of a body."""
     known = _CORES | {core for cores in _MIDDLE.values() for core in cores} | _MIDDLE_MARKERS
     split = [split_label(label)[1] for label in labels]
-    return [n for n, core in zip(labels, split, strict=True)
-            if core not in known and not _SPINE.fullmatch(core)]  # fmt: skip
+    return [
+        n
+        for n, core in zip(labels, split, strict=True)
+        if core not in known and not _SPINE.fullmatch(core)
+    ]
 
 
 def find_places(labels: Sequence[str]) -> Found:

@@ -1,4 +1,4 @@
-"""What OpenUSD reads of a file; a script of its own, see `formats.limited`."""
+"""A process of its own reads a file with OpenUSD; a script, see `formats.limited`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user gets: the simulated motion on the skeleton that came in, the score, the report."""
+"""A user's files: the simulated motion on the skeleton that came in, the score, the report."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ RUN = "run"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Imitated(Result):
-    """What came of an imitation.
+    """The result of an imitation.
 
     Attributes:
         task: the motion with its body.
@@ -89,7 +89,7 @@ class Imitated(Result):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was repaired in the motion, and what holding the feet did."""
+        """Sentences on repairs of the motion and on feet that were held."""
         own = [n for clip in self.task.library for n in clip.skeleton.source.notes]
         if self.tracked is not None:
             own += [*self.sentences, *self.tracked.notes]
@@ -206,7 +206,7 @@ def _limit(minutes: float, iterations: int | None) -> Until:
 
 @dataclass(frozen=True)
 class Job:
-    """What `imitate` does, for Python and the command line.
+    """The job of `imitate`, for Python and the command line.
 
     Attributes:
         read: gives the clips, a single one where a policy begins.
@@ -229,7 +229,7 @@ class Job:
     def done(
         self, policy: Tracker | Run | str | Path | None = None, nothing: bool = False
     ) -> Imitated | None:
-        """What came of the clips; None on every process of `torchrun` but the first.
+        """The result for the clips; None on every process of `torchrun` but the first.
 
         nothing: no policy begins.
 
@@ -251,7 +251,7 @@ class Job:
         return Imitated(task, net, evaluation, self.run, result.interrupted)
 
     def _practised(self, policy: Tracker | Run | str | Path | None) -> Imitated | None:
-        """What a policy makes of the clip; None where that which comes with Poise does not fit."""
+        """The result by a policy; None if the one that comes with Poise does not fit."""
         (clip,) = self.read()
         self.told.given(ClipLibrary.of(clip))
         with self.told.doing("opening the policy"):
@@ -266,9 +266,17 @@ class Job:
             return None
         with claimed(self.run.parent):
             made = practise(
-                clip, tracker, self.run, self.until, self.config.seed, self.threads, self.device,
-                self.told, self.attended, self.in_place,
-            )  # fmt: skip
+                clip,
+                tracker,
+                self.run,
+                self.until,
+                self.config.seed,
+                self.threads,
+                self.device,
+                self.told,
+                self.attended,
+                self.in_place,
+            )
         if made.tracked is None:
             raise KeyboardInterrupt
         t, own, result = made.tracked, made.learned.tracker.policy, made.learned.result

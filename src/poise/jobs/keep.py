@@ -1,4 +1,4 @@
-"""What is written: nothing that is there is lost unless it is said so, and folders are tried first."""
+"""Files are written so that none is lost unless it is said so, and folders are tried first."""
 
 from __future__ import annotations
 

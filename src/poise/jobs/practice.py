@@ -151,12 +151,12 @@ def practise(
 
 
 def _in_place(tracked: Tracked, travel: InPlace | None) -> Tracked:
-    """What was simulated of a clip in place, to be written as it came."""
+    """The simulation of a clip in place, to be written as it came."""
     return tracked if travel is None else replace(tracked, travel=travel)
 
 
 def _moving(clip: Clip, travel: InPlace | None) -> Clip:
-    """What is simulated of a clip."""
+    """The part of a clip that is simulated."""
     return clip if travel is None else travel.clip
 
 
@@ -196,7 +196,7 @@ def _best(
     told: Watching,
     travel: InPlace | None,
 ) -> Practised:
-    """What is kept of all that was tried, and why."""
+    """The attempt that is kept, and why."""
     moving, said = _moving(clip, travel), list[str]()
     own = _in_place(from_every_start(learned.tracker, moving, device), travel)
     if newtons:

@@ -1,4 +1,4 @@
-"""What the verbs of `import poise` give back: a motion, its score, what is to be said about it."""
+"""Results of the verbs of `import poise`: a motion, its score, the sentences about it."""
 
 from __future__ import annotations
 

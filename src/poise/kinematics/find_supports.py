@@ -1,4 +1,4 @@
-"""Which supports a motion needs: found by inverse dynamics, where floor and feet cannot bear it."""
+"""Supports that a motion needs, found by inverse dynamics where floor and feet cannot bear it."""
 
 # pyright: reportMissingTypeStubs=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations

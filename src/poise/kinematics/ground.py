@@ -1,4 +1,4 @@
-"""Where the floor lies under a motion, and the lift that sets the feet on it."""
+"""The floor's height under a motion, and the lift that sets the feet on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What inverse kinematics must know of a humanoid, and the plane in which a limb bends."""
+"""A humanoid as inverse kinematics sees it, and the plane in which a limb bends."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from __future__ import annotations

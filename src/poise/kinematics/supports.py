@@ -477,9 +477,15 @@ def boxed(group: Sequence[tuple[Candidate, float]], solid: Solid) -> Support | N
     names = [f"{r.side} {r.kind}".replace("_", " ").strip() for r in (solid.table.rows[i] for i in rows)]
     start, stop = min(c.start for c, _ in group), max(c.stop for c, _ in group)
     return Support(
-        first.group.kind, size, (float(middle[0]), float(middle[1]), float(middle[2])), yaw,
-        start / solid.fps, stop / solid.fps, tuple(dict.fromkeys(names)), max(f for _, f in group),
-    )  # fmt: skip
+        first.group.kind,
+        size,
+        (float(middle[0]), float(middle[1]), float(middle[2])),
+        yaw,
+        start / solid.fps,
+        stop / solid.fps,
+        tuple(dict.fromkeys(names)),
+        max(f for _, f in group),
+    )
 
 
 def _yaw(c: Candidate, solid: Solid) -> float:

@@ -244,9 +244,14 @@ class Between(nn.Module):
         return self.posterior[1](hidden).chunk(2, -1)
 
     def forward(
-        self, root: Tensor, rot: Tensor, known: Tensor, offsets: Tensor, code: Tensor | None = None,
+        self,
+        root: Tensor,
+        rot: Tensor,
+        known: Tensor,
+        offsets: Tensor,
+        code: Tensor | None = None,
         drop: Dropout | None = None,
-    ) -> tuple[GapFrames, GapFrames | None]:  # fmt: skip
+    ) -> tuple[GapFrames, GapFrames | None]:
         """All frames and, with a refiner, the refined ones.
 
         Args:
@@ -278,9 +283,17 @@ class Between(nn.Module):
         )
 
     def _correct(
-        self, encoder: _Encoder, x: Tensor, root: Tensor, sixd: Tensor, mats: Tensor,
-        known: Tensor, near: Neighbours, extra: Tensor | None, drop: Dropout | None,
-    ) -> GapFrames:  # fmt: skip
+        self,
+        encoder: _Encoder,
+        x: Tensor,
+        root: Tensor,
+        sixd: Tensor,
+        mats: Tensor,
+        known: Tensor,
+        near: Neighbours,
+        extra: Tensor | None,
+        drop: Dropout | None,
+    ) -> GapFrames:
         out = encoder(x, known, near, extra, drop).float()
         joints = self.layout.joints
         free = (~known).to(out)[:, None]
@@ -291,9 +304,13 @@ class Between(nn.Module):
         return GapFrames(root, mats, out[..., 3 + 6 * joints :])
 
     def complete(
-        self, root: Tensor, rot: Tensor, known: Tensor, offsets: Tensor,
+        self,
+        root: Tensor,
+        rot: Tensor,
+        known: Tensor,
+        offsets: Tensor,
         noise: torch.Generator | None = None,
-    ) -> FilledGap:  # fmt: skip
+    ) -> FilledGap:
         """All frames `(N, T, ...)`, in the world, with the unknown ones filled; see `forward`."""
         at = last_before_gap(known)
         place = place_of(root[:, at], rot[:, at], self.layout.facing)

@@ -327,11 +327,16 @@ def save_model(path: Path, model: InbetweenModel, half: bool = False) -> None:
     """Writes a model atomically; `half` keeps weights in half precision (a few MB)."""
     tensors = {k: v.half() if half else v for k, v in model.net.state_dict().items()}
     meta = {
-        "kind": "inbetween model", "net": model.kind,
-        "config": dataclasses.asdict(model.net.config), "layout": dataclasses.asdict(model.layout),
-        "names": list(model.names), "fps": model.fps, "longest": model.longest, "past": model.past,
+        "kind": "inbetween model",
+        "net": model.kind,
+        "config": dataclasses.asdict(model.net.config),
+        "layout": dataclasses.asdict(model.layout),
+        "names": list(model.names),
+        "fps": model.fps,
+        "longest": model.longest,
+        "past": model.past,
         "meta": dict(model.meta),
-    }  # fmt: skip
+    }
     tensors = prefixed("net", tensors) | {"offsets": model.offsets}
     if model.example is not None:
         tensors |= prefixed("example", model.example[0])
@@ -374,9 +379,16 @@ def load_model(path: Path) -> InbetweenModel:
         if "example" in meta:
             example = under("example", tensors), meta["example"]
         return InbetweenModel(
-            meta["net"], net.eval(), tuple(meta["names"]), tensors["offsets"], meta["fps"],
-            meta["longest"], meta["past"], meta["meta"], example,
-        )  # fmt: skip
+            meta["net"],
+            net.eval(),
+            tuple(meta["names"]),
+            tensors["offsets"],
+            meta["fps"],
+            meta["longest"],
+            meta["past"],
+            meta["meta"],
+            example,
+        )
     except PoiseError as problem:
         raise PoiseError(
             problem.what, problem.where or path, problem.hint or hint, code=problem.code

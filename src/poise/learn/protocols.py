@@ -1,4 +1,4 @@
-"""What the learner asks of an environment, and what others may ask of a policy."""
+"""Protocols: an environment as the learner sees it, and a policy as others see it."""
 
 from __future__ import annotations
 

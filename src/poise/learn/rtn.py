@@ -112,9 +112,12 @@ class RTN(nn.Module):
                 p.uniform_(-(c.hidden**-0.5), c.hidden**-0.5, generator=generator)
         a, b = c.decoder
         self.decoder = nn.Sequential(
-            linear(c.hidden, a, generator), PLU(), linear(a, b, generator), PLU(),
+            linear(c.hidden, a, generator),
+            PLU(),
+            linear(a, b, generator),
+            PLU(),
             linear(b, quats + 3 + feet, generator, 0.01),
-        )  # fmt: skip
+        )
         # Roots enter and leave in units of how much they vary (the paper uses raw centimetres).
         self.register_buffer("velocity_std", torch.full((3,), 0.02))
         self.register_buffer("offset_std", torch.full((3,), 0.5))
@@ -223,9 +226,12 @@ class Critic(nn.Module):
         super().__init__()
         self.window = window
         self.layers = nn.Sequential(
-            linear(channels * window, 512, generator), nn.ReLU(),
-            linear(512, 256, generator), nn.ReLU(), linear(256, 1, generator),
-        )  # fmt: skip
+            linear(channels * window, 512, generator),
+            nn.ReLU(),
+            linear(512, 256, generator),
+            nn.ReLU(),
+            linear(256, 1, generator),
+        )
 
     def forward(self, frames: Tensor) -> Tensor:
         """`(N, T, channels)` to one number per sequence `(N)`."""

@@ -1,4 +1,4 @@
-"""What every in-betweening network takes and gives: known frames in, a transition out."""
+"""The interface of every in-betweening network: known frames in, a transition out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each character is to do next: its person's pose, endless motion, or what its state asks for."""
+"""The next goal of each character: its person's pose, endless motion, or what its state asks for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where motion comes from: a file played as a stream, and JSON messages of one connection."""
+"""Sources of motion: a file played as a stream, and JSON messages of one connection."""
 
 from __future__ import annotations
 

@@ -25,18 +25,27 @@ from poise.motion import Clip, Skeleton
 
 #: Bones with their parents, from the hips on; fingers, eyes and jaw are left out.
 PARENTS: dict[str, str | None] = {
-    "Hips": None, "Spine": "Hips", "Chest": "Spine", "UpperChest": "Chest", "Neck": "UpperChest",
+    "Hips": None,
+    "Spine": "Hips",
+    "Chest": "Spine",
+    "UpperChest": "Chest",
+    "Neck": "UpperChest",
     "Head": "Neck",
     **{
         side + bone: parent if parent in ("Hips", "UpperChest") else side + parent
         for side in ("Left", "Right")
         for bone, parent in (
-            ("Shoulder", "UpperChest"), ("UpperArm", "Shoulder"), ("LowerArm", "UpperArm"),
-            ("Hand", "LowerArm"), ("UpperLeg", "Hips"), ("LowerLeg", "UpperLeg"), ("Foot", "LowerLeg"),
+            ("Shoulder", "UpperChest"),
+            ("UpperArm", "Shoulder"),
+            ("LowerArm", "UpperArm"),
+            ("Hand", "LowerArm"),
+            ("UpperLeg", "Hips"),
+            ("LowerLeg", "UpperLeg"),
+            ("Foot", "LowerLeg"),
             ("Toes", "Foot"),
         )
     },
-}  # fmt: skip
+}
 #: Bones that every VRM model has.
 NEEDED = tuple(
     b
@@ -45,13 +54,21 @@ NEEDED = tuple(
 )
 #: m, T-pose of a person of 1.6 m: x ahead, y left, z up; right sides mirror left ones.
 _OFFSETS = {
-    "Hips": (0.0, 0.0, 0.0), "Spine": (0.0, 0.0, 0.07), "Chest": (0.0, 0.0, 0.12),
-    "UpperChest": (0.0, 0.0, 0.12), "Neck": (0.0, 0.0, 0.13), "Head": (0.01, 0.0, 0.08),
-    "LeftShoulder": (0.0, 0.03, 0.10), "LeftUpperArm": (0.0, 0.10, 0.0),
-    "LeftLowerArm": (0.0, 0.25, 0.0), "LeftHand": (0.0, 0.23, 0.0),
-    "LeftUpperLeg": (0.0, 0.09, -0.05), "LeftLowerLeg": (0.0, 0.0, -0.38),
-    "LeftFoot": (0.0, 0.0, -0.39), "LeftToes": (0.12, 0.0, -0.07),
-}  # fmt: skip
+    "Hips": (0.0, 0.0, 0.0),
+    "Spine": (0.0, 0.0, 0.07),
+    "Chest": (0.0, 0.0, 0.12),
+    "UpperChest": (0.0, 0.0, 0.12),
+    "Neck": (0.0, 0.0, 0.13),
+    "Head": (0.01, 0.0, 0.08),
+    "LeftShoulder": (0.0, 0.03, 0.10),
+    "LeftUpperArm": (0.0, 0.10, 0.0),
+    "LeftLowerArm": (0.0, 0.25, 0.0),
+    "LeftHand": (0.0, 0.23, 0.0),
+    "LeftUpperLeg": (0.0, 0.09, -0.05),
+    "LeftLowerLeg": (0.0, 0.0, -0.38),
+    "LeftFoot": (0.0, 0.0, -0.39),
+    "LeftToes": (0.12, 0.0, -0.07),
+}
 
 
 def from_unity(pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

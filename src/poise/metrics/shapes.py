@@ -1,4 +1,4 @@
-"""Where a character's geoms touch: lowest points, surface points of the feet, centre of mass."""
+"""Places at which a character's geoms touch: lowest points, surface points of feet, centre of mass."""
 
 from __future__ import annotations
 

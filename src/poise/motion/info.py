@@ -1,4 +1,4 @@
-"""What a clip is, in a few numbers: rate, length, unit, the person's height, what was guessed."""
+"""A clip in a few numbers: rate, length, unit, the person's height, its guesses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which joint plays which part of a human body, by names and tree; which joint moves which."""
+"""Joints by the part of a human body that they play, from names and tree; joints that move others."""
 
 from __future__ import annotations
 

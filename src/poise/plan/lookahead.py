@@ -236,8 +236,12 @@ class LookaheadConfig:
     noise_range: Annotated[tuple[float, float], Range(0, above=True, rising=True)] = (0.03, 0.3)
     warm: Share = 0.5
     smoothing: Annotated[tuple[float, ...], Range(0, 1, below=True), Length(1)] = (
-        0.0, 0.5, 0.7, 0.9, 0.97
-    )  # fmt: skip
+        0.0,
+        0.5,
+        0.7,
+        0.9,
+        0.97,
+    )
     corrections: Annotated[tuple[float, ...], Range(0, 1)] = (1.0, 0.7, 0.4, 0.1)
     jerk_price: NotNegative = 0.5
     slide_price: NotNegative = 12.0

@@ -1,4 +1,4 @@
-"""What every imitation recipe shares: a built task that can be trained and watched."""
+"""The base of every imitation recipe: a built task that can be trained and watched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a simulator must offer: the Backend protocol, the state that it shows, physics settings."""
+"""The protocol of a simulator, the state that it shows, and physics settings."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations

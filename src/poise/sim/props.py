@@ -156,10 +156,14 @@ class Door(Checked):
         "NAME/knob_back"."""
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
         body.add_joint(
-            name=self.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1],
-            range=[-self.opens, self.opens], limited=True, damping=[self.damping, 0, 0],
+            name=self.name,
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=[0, 0, 1],
+            range=[-self.opens, self.opens],
+            limited=True,
+            damping=[self.damping, 0, 0],
             frictionloss=self.friction,
-        )  # fmt: skip
+        )
         gap = 0.01
         half = [self.thickness / 2, self.width / 2, (self.height - gap) / 2]
         at = [0.0, self.width / 2, gap + half[2]]
@@ -198,16 +202,23 @@ class Lift(Checked):
         """Adds one body with a slide and its actuator."""
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), gravcomp=1.0)
         body.add_joint(
-            name=self.name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], limited=True,
-            range=[-self.travel, self.travel], damping=[self.damping, 0, 0],
-        )  # fmt: skip
+            name=self.name,
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=[0, 0, 1],
+            limited=True,
+            range=[-self.travel, self.travel],
+            damping=[self.damping, 0, 0],
+        )
         half, x, y = 0.02, *self.size
         at = [0.0, 0.0, -half]
         solid(body, self.name, "box", [x / 2, y / 2, half], pos=at, mass=self.mass)
         servo = spec.add_actuator(
-            name=self.name, target=self.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-        )  # fmt: skip
+            name=self.name,
+            target=self.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        )
         servo.gainprm[0], servo.biasprm[1] = self.stiffness, -self.stiffness
 
 
@@ -253,9 +264,11 @@ class Mesh:
         holes = _open_edges(model.mesh_vert, model.mesh_face)
         if holes:
             raise PoiseError(
-                f"the mesh is not closed: {holes} of its edges have no two faces", str(self.path),
-                "Fill its holes, or use a box", code="mesh-unusable",
-            )  # fmt: skip
+                f"the mesh is not closed: {holes} of its edges have no two faces",
+                str(self.path),
+                "Fill its holes, or use a box",
+                code="mesh-unusable",
+            )
         spec.add_mesh(name=self.name, file=str(Path(self.path).resolve()))
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), quat=list(self.quat))
         if self.mass:
@@ -366,10 +379,16 @@ class Trampoline(Checked):
             foot = [a + b for a, b in zip(self.pos, corner, strict=True)]
             spec.worldbody.add_site(name=f"{name}/foot", pos=foot)
             servo = spec.add_actuator(
-                name=name, target=name, refsite=f"{name}/foot", trntype=mujoco.mjtTrn.mjTRN_SITE,
-                gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                name=name,
+                target=name,
+                refsite=f"{name}/foot",
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
                 gear=[0, 0, 1, 0, 0, 0],
-            )  # fmt: skip
+            )
             servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = (
-                self.stiffness, -self.stiffness, -self.damping,
-            )  # fmt: skip
+                self.stiffness,
+                -self.stiffness,
+                -self.damping,
+            )

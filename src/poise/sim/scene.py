@@ -1,4 +1,4 @@
-"""What stands in one world: characters, props, links between them, and the floor.
+"""The contents of one world: characters, props, links between them, and the floor.
 
 scene = Scene(
     things=(Character(humanoid, "anna"), Door(), Ball(pos=(0, 0, 2))),

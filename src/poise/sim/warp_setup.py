@@ -1,4 +1,4 @@
-"""What the Warp backend needs before its first step: the packages, a device, enough room."""
+"""Checks before the Warp backend's first step: the packages, a device, enough room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all backends share: what they show, and what they check before they touch their worlds."""
+"""The common base of all backends: the state they show, and their checks before worlds change."""
 
 from __future__ import annotations
 

@@ -200,9 +200,15 @@ def drawn(length: int, fps: float, noise: torch.Generator) -> Detour | None:
 
 
 def through(
-    net: Between, root: Tensor, rot: Tensor, seen: Tensor, offsets: Tensor, guess: FilledGap,
-    detour: Detour, noise: torch.Generator,
-) -> FilledGap:  # fmt: skip
+    net: Between,
+    root: Tensor,
+    rot: Tensor,
+    seen: Tensor,
+    offsets: Tensor,
+    guess: FilledGap,
+    detour: Detour,
+    noise: torch.Generator,
+) -> FilledGap:
     """The frames of one window `(1, T, ...)` again, led through a detour of the best guess.
 
     Args:

@@ -229,9 +229,15 @@ def stepped(
 
 
 def _walked(
-    skeleton: Skeleton, motion: Motion, pos: Tensor, quat: Tensor, ankles: Sequence[int],
-    toes: Mapping[int, int], paths: Sequence[FootPath], fps: float,
-) -> Motion:  # fmt: skip
+    skeleton: Skeleton,
+    motion: Motion,
+    pos: Tensor,
+    quat: Tensor,
+    ankles: Sequence[int],
+    toes: Mapping[int, int],
+    paths: Sequence[FootPath],
+    fps: float,
+) -> Motion:
     """The motion with its feet on their paths."""
     root, rot = motion[0], motion[1].clone()
     goals: dict[int | str, Tensor] = {}
@@ -286,9 +292,14 @@ def _lowered(
 
 
 def lock_feet(
-    skeleton: Skeleton, feet: Sequence[int], root: Tensor, rot: Tensor, contact: Tensor, free: Tensor,
+    skeleton: Skeleton,
+    feet: Sequence[int],
+    root: Tensor,
+    rot: Tensor,
+    contact: Tensor,
+    free: Tensor,
     fps: float,
-) -> Tensor:  # fmt: skip
+) -> Tensor:
     """Rotations `(T, J, 4)` with the feet held still while they stand; the root's path stays.
 
     A foot that cannot stand, since the kept frames at both ends have it in other places, takes a step,

@@ -64,9 +64,13 @@ class Codes:
         return (past[:, picks] * self.weights).flatten(1)
 
     def draw(
-        self, past: Tensor, count: int, rng: torch.Generator, temperature: float,
+        self,
+        past: Tensor,
+        count: int,
+        rng: torch.Generator,
+        temperature: float,
         kinds: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+    ) -> Tensor:
         """`(N * count, Z)`: so many codes for each of the pasts `(N, p, D)`, in deviations; of labels
         `kinds (N,)` alone, if they are given."""
         near, index = self._nearest(past, NEAREST, kinds)

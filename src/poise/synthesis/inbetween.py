@@ -248,9 +248,11 @@ def retimed(
 
 #: What words mean.
 PARTS = {
-    "hands": ("left_hand", "right_hand"), "feet": ("left_foot", "right_foot"), "pelvis": (PELVIS,),
+    "hands": ("left_hand", "right_hand"),
+    "feet": ("left_foot", "right_foot"),
+    "pelvis": (PELVIS,),
     **{limb: (limb,) for limb in LIMBS},
-}  # fmt: skip
+}
 EVERYTHING = ("hands", "feet", "pelvis")
 
 

@@ -1,4 +1,4 @@
-"""What a filled gap may do: speeds, heights, flights by gravity, and seams that meet."""
+"""Limits of a filled gap: speeds, heights, flights by gravity, and seams that meet."""
 
 from __future__ import annotations
 
@@ -26,9 +26,18 @@ from poise.motion.rotations import (
 
 #: m/s, the fastest of a thousand frames of each part in CMU's motions and DeepMimic's (30 Hz, 62 clips).
 FASTEST = {
-    "pelvis": 4.0, "spine": 3.5, "neck": 3.6, "head": 3.6, "clavicle": 3.5, "upper_arm": 4.0,
-    "forearm": 6.5, "hand": 9.0, "thigh": 4.0, "shin": 6.5, "foot": 10.0,
-}  # fmt: skip
+    "pelvis": 4.0,
+    "spine": 3.5,
+    "neck": 3.6,
+    "head": 3.6,
+    "clavicle": 3.5,
+    "upper_arm": 4.0,
+    "forearm": 6.5,
+    "hand": 9.0,
+    "thigh": 4.0,
+    "shin": 6.5,
+    "foot": 10.0,
+}
 #: Shares of the network's motion that are tried, the rest being interpolated.
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: m above its height on the floor from which on a body is in the air.

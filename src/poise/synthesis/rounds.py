@@ -18,9 +18,16 @@ from poise.synthesis.limits import Calmed, Feet, Motion, excess
 
 #: Kinds of faults that frames between keyframes can have; the others are of the file or its skeleton.
 JUDGED = (
-    "missing frames", "teleport", "flip", "speed", "jitter", "root jitter", "float", "penetration",
+    "missing frames",
+    "teleport",
+    "flip",
+    "speed",
+    "jitter",
+    "root jitter",
+    "float",
+    "penetration",
     "foot slide",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)

@@ -102,9 +102,11 @@ class Figures:
         deep = penetration(lowest_points(state.pos, state.quat, self._shapes)).mean_mm
         speed = torch.diff(state.pos, dim=0).norm(dim=-1).mean(-1) * self.fps
         values = (
-            float(foot_slide(soles, self.fps)), float(deep), float(jerk(state.pos, self.fps).mean()),
+            float(foot_slide(soles, self.fps)),
+            float(deep),
+            float(jerk(state.pos, self.fps).mean()),
             float(speed.mean()),
-        )  # fmt: skip
+        )
         for k, value in enumerate(values):
             if np.isfinite(value):
                 self._sums[k] += value * len(qpos)
@@ -443,9 +445,11 @@ class MotionWriter:
         free = shutil.disk_usage(path.parent).free
         if need > free:
             raise PoiseError(
-                f"the motion takes about {need / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free", path,
-                "Make a shorter one, or choose another disk", code="disk-full",
-            )  # fmt: skip
+                f"the motion takes about {need / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free",
+                path,
+                "Make a shorter one, or choose another disk",
+                code="disk-full",
+            )
         self._beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
         self._pieces = list[Clip]()
         self._turns: np.ndarray | None = None

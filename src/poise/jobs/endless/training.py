@@ -288,13 +288,20 @@ def begin(
     if minutes is not None:
         config = from_data(Endless, to_data(config) | {"steps": steps_in(motions, config, minutes)}, run)
     meta: _TrainingMeta = {
-        "kind": "endless run", "config": to_data(config), "library": said,
-        "hinges": list(motions.hinges), "fps": motions.fps, "clips": list(motions.clips),
-    }  # fmt: skip
+        "kind": "endless run",
+        "config": to_data(config),
+        "library": said,
+        "hinges": list(motions.hinges),
+        "fps": motions.fps,
+        "clips": list(motions.clips),
+    }
     tensors = {
-        "frames": motions.frames.frames, "first": motions.frames.first, "seeds": motions.seeds,
-        "bounds": motions.bounds, "reach": motions.reach,
-    }  # fmt: skip
+        "frames": motions.frames.frames,
+        "first": motions.frames.first,
+        "seeds": motions.seeds,
+        "bounds": motions.bounds,
+        "reach": motions.reach,
+    }
     save_checkpoint(run, tensors, dict(meta))
     return motions, config
 
@@ -312,9 +319,14 @@ def opened(run: Path) -> tuple[Motions, Endless, list[str]]:
         take(tensors, k) for k in ("frames", "first", "seeds", "bounds", "reach")
     )
     motions = Motions(
-        PackedFrames(frames, first), seeds, bounds, reach, tuple(meta["hinges"]), float(meta["fps"]),
+        PackedFrames(frames, first),
+        seeds,
+        bounds,
+        reach,
+        tuple(meta["hinges"]),
+        float(meta["fps"]),
         tuple(meta["clips"]),
-    )  # fmt: skip
+    )
     return motions, from_data(Endless, meta["config"], run), meta["library"]
 
 

@@ -63,14 +63,29 @@ class Inbetween(Checked):
         from poise.score.gaps import LAFAN1
 
         own: dict[str, Any] = {
-            "net": "rtn", "name": LAFAN1.name, "final": LAFAN1.final, "contacts": "harvey", "fps": 30.0,
-            "ema": 0.0, "mirror": False, "stretch": 1.0,
+            "net": "rtn",
+            "name": LAFAN1.name,
+            "final": LAFAN1.final,
+            "contacts": "harvey",
+            "fps": 30.0,
+            "ema": 0.0,
+            "mirror": False,
+            "stretch": 1.0,
             "rtn": RTNConfig(encoder=(512, 256), decoder=(512, 256), past=10, longest=30, noise=0.5),
             "rtn_training": RTNTraining(
-                batch=32, lr=1e-3, decay=False, shortest=5, quat=1.0, pos=1.0, root=0.5, contact=0.1,
-                adversarial=0.1, equalise=True, products="float32",
+                batch=32,
+                lr=1e-3,
+                decay=False,
+                shortest=5,
+                quat=1.0,
+                pos=1.0,
+                root=0.5,
+                contact=0.1,
+                adversarial=0.1,
+                equalise=True,
+                products="float32",
             ),
-        }  # fmt: skip
+        }
         return cls(**(own | changes))
 
     @classmethod

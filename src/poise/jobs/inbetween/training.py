@@ -166,9 +166,18 @@ def _bank(tensors: dict[str, torch.Tensor], meta: dict[str, Any]) -> FrameBank:
     x, y, z = meta["facing"]
     ends = tuple((j, (a, b, c)) for j, (a, b, c) in meta.get("ends", ()))
     return FrameBank(
-        tuple(meta["names"]), tuple(meta["parents"]), meta["bank_fps"], tensors["root"], tensors["rot"],
-        tensors["offsets"], tensors["first"], tuple(meta["clips"]), tuple(meta["feet"]), (x, y, z), ends,
-    )  # fmt: skip
+        tuple(meta["names"]),
+        tuple(meta["parents"]),
+        meta["bank_fps"],
+        tensors["root"],
+        tensors["rot"],
+        tensors["offsets"],
+        tensors["first"],
+        tuple(meta["clips"]),
+        tuple(meta["feet"]),
+        (x, y, z),
+        ends,
+    )
 
 
 RUN_FILE = "run.safetensors"

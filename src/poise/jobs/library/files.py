@@ -1,4 +1,4 @@
-"""Which files a library consists of, how its clips are called, and the key of their content."""
+"""The files of a library, the names of its clips, and the key of their content."""
 
 from __future__ import annotations
 

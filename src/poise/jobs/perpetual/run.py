@@ -61,10 +61,14 @@ def finish(stages: StageTrainer) -> tuple[ClipResults, RecoveryCard | None]:
     policy, t, stage = stages.policy(), stages.trainer, stages.stage
     imitation, where = staged(stages.imitation, stage), (stages.threads, stages.device)
     facts = {
-        "method": imitation.config.method, "seed": imitation.config.seed, "stage": stage.name,
-        "recovers": stages.recovers, "primitives": stages.primitives,
-        "solved": stages.finished, "iterations": stages.iteration,
-    }  # fmt: skip
+        "method": imitation.config.method,
+        "seed": imitation.config.seed,
+        "stage": stage.name,
+        "recovers": stages.recovers,
+        "primitives": stages.primitives,
+        "solved": stages.finished,
+        "iterations": stages.iteration,
+    }
     cost = {"samples": t.samples, "seconds": round(t.seconds, 1)}
     results, card = evaluate_clips(imitation, policy, None, 0.0, *where), None
     if stages.recovers:
@@ -74,20 +78,33 @@ def finish(stages: StageTrainer) -> tuple[ClipResults, RecoveryCard | None]:
     names, owner = imitation.library.names, stages.stage_record.owner.tolist()
     rows = [
         {
-            "clip": names[c], "succeeded": bool(results.succeeded[k]), "frames": int(results.frames[k]),
-            "tracked": int(results.tracked[k]), "mpjpe_mm": round(float(results.mpjpe_mm[k]), 3),
-            "mpjpe_global_mm": round(float(results.global_mm[k]), 3), "primitive": owner[c] + 1,
+            "clip": names[c],
+            "succeeded": bool(results.succeeded[k]),
+            "frames": int(results.frames[k]),
+            "tracked": int(results.tracked[k]),
+            "mpjpe_mm": round(float(results.mpjpe_mm[k]), 3),
+            "mpjpe_global_mm": round(float(results.global_mm[k]), 3),
+            "primitive": owner[c] + 1,
         }
         for k, c in enumerate(results.clip.tolist())
-    ]  # fmt: skip
-    said = facts | cost | {
-        "version": __version__, "help_n": 0.0, "succ": results.rate, "clips": len(rows),
-        "mpjpe_global_mm": round(results.error_mm, 3),
-        "recovery": {
-            "policy": None if card is None else card.to_dict(), "primitive": stages.stage_record.recovery
-        },
-        "hardest": [names[c] for c in results.hardest(20)], "per_clip": rows,
-    }  # fmt: skip
+    ]
+    said = (
+        facts
+        | cost
+        | {
+            "version": __version__,
+            "help_n": 0.0,
+            "succ": results.rate,
+            "clips": len(rows),
+            "mpjpe_global_mm": round(results.error_mm, 3),
+            "recovery": {
+                "policy": None if card is None else card.to_dict(),
+                "primitive": stages.stage_record.recovery,
+            },
+            "hardest": [names[c] for c in results.hardest(20)],
+            "per_clip": rows,
+        }
+    )
     write_atomic(stages.folder / RESULT, json.dumps(said, indent=2, allow_nan=False).encode())
     return results, card
 

@@ -452,9 +452,14 @@ def taught_by(teacher: Perpetual, **changes: Any) -> Perpetual:
     """The settings of a policy that another teaches: the teacher's own but for `changes`. Where its goal
     is keypoints, its actions are absolute, and it keeps no filter that would delay them."""
     own: dict[str, Any] = {
-        "expert": False, "trajopt": None, "help_start": 0.0, "teacher": None,
-        "single": True, "multiplicative": True, "progressive": True,
-    }  # fmt: skip
+        "expert": False,
+        "trajopt": None,
+        "help_start": 0.0,
+        "teacher": None,
+        "single": True,
+        "multiplicative": True,
+        "progressive": True,
+    }
     if changes.get("goal") == "keypoints" and teacher.goal == "rotations":
         own |= {"action": "absolute", "filter": 0.0, "ppo": replace(teacher.ppo, std=STD)}
     return replace(teacher, **(own | changes))
@@ -485,11 +490,14 @@ def distilled(
     env.weights = odds(imitation, stage, (frames - 1).double(), own.reference.length)
     try:
         taught = clone(
-            cast(VecEnv, env), PolicyTeacher(env, tracker),
+            cast(VecEnv, env),
+            PolicyTeacher(env, tracker),
             config.clone or clone_for(int(frames.sum()), worlds),
-            replace(ppo, policy_hidden=config.single_hidden), config.seed,
-            (tell or TrainingCallbacks()).round, start,
-        )  # fmt: skip
+            replace(ppo, policy_hidden=config.single_hidden),
+            config.seed,
+            (tell or TrainingCallbacks()).round,
+            start,
+        )
     finally:
         env.close()
     return taught[0]

@@ -1,4 +1,4 @@
-"""Which controller does a motion, and which of several attempts is kept."""
+"""Controllers that do a motion, and the choice among several attempts."""
 
 from __future__ import annotations
 

@@ -126,9 +126,15 @@ def _goals(imitation: Imitation, before: Simulation, last: int) -> Imitation:
 
 
 def _take(
-    tracker: Tracker, goals: Imitation, config: TrackConfig, before: Simulation, first: int, last: int,
-    show: Show | None, prices: Tensor | None,
-) -> Segment | int:  # fmt: skip
+    tracker: Tracker,
+    goals: Imitation,
+    config: TrackConfig,
+    before: Simulation,
+    first: int,
+    last: int,
+    show: Show | None,
+    prices: Tensor | None,
+) -> Segment | int:
     """Simulates a part; or the frame at which it was lost."""
     rate, end = before.rate_hz, before.frames - 1
     settle, fade = round(SETTLE_S * rate), max(2, round(FADE_S * rate))

@@ -1,4 +1,4 @@
-"""What was simulated, kept beside a result so that a part of it can be simulated anew."""
+"""A simulation, kept beside a result so that a part of it can be simulated anew."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in the world of a character that tracks: supports, and the others of a crowd."""
+"""The world of a character that tracks: supports, and the others of a crowd."""
 
 from __future__ import annotations
 

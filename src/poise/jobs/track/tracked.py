@@ -1,4 +1,4 @@
-"""What came of tracking: the motion, its score, its files, each part of a chain, told in a sentence."""
+"""The result of tracking: the motion, its score, its files, each part of a chain, in a sentence."""
 
 # pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
@@ -272,7 +272,7 @@ def with_parts(card: ScoreCard, parts: Sequence[ChainPart]) -> ScoreCard:
     told = tuple(
         {**row, "done": p.done, "begins_s": p.begins, "ends_s": p.ends, "after_s": p.after}
         for row, p in rows
-    )  # fmt: skip
+    )
     return replace(card, per_clip=told)
 
 

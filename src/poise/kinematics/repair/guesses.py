@@ -1,4 +1,4 @@
-"""What had to be guessed about a clip: each value with its evidence and how to state it instead."""
+"""Guesses about a clip: each value with its evidence and how to state it instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a motion needs that is not there: a seat, something to hold or to stand on, a partner's arms."""
+"""Needs of a motion that are not met: a seat, something to hold or to stand on, a partner's arms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a body meets the floor: its soles, its lowest points, the faults of its stance."""
+"""The places where a body meets the floor: soles, lowest points, the faults of its stance."""
 
 from __future__ import annotations
 

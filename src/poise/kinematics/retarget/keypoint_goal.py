@@ -80,9 +80,17 @@ class PointBody:
         clip = fit_clip(points, config)
         skeleton = onto if isinstance(onto, Skeleton) else onto.skeleton
         body = cls(
-            points.names, skeleton, table, {p: found[p] for p in seen}, rest, share, bones_of(rest),
-            Retargeter.between(clip, onto), 0.0, clip.skeleton.source.notes,
-        )  # fmt: skip
+            points.names,
+            skeleton,
+            table,
+            {p: found[p] for p in seen},
+            rest,
+            share,
+            bones_of(rest),
+            Retargeter.between(clip, onto),
+            0.0,
+            clip.skeleton.source.notes,
+        )
         places = np.stack([_mean(points.positions, k) for k in body.places.values()], 1)
         pos, quat = body.pose(places)
         whole = ~torch.isnan(pos).flatten(1).any(1)

@@ -1,4 +1,4 @@
-"""What a retargeting did and how good it is, in numbers and sentences."""
+"""A report of a retargeting: its steps and its quality, in numbers and sentences."""
 
 from __future__ import annotations
 

@@ -22,9 +22,13 @@ from poise.sim import Backend, Drive, SimConfig
 
 #: Directions that are pushed in, world axes.
 AXES = (
-    (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0,
-    -1.0),
-)  # fmt: skip
+    (1.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (0.0, 0.0, -1.0),
+)
 #: s: the character stands, is pushed, and its hand is looked at in the last of it.
 STANDS_S, PUSHED_S, SEEN_S = 2.0, 3.0, 1.0
 #: N, with which hands are pushed at most: by 20 N some make a step, and what is measured is the step.

@@ -92,9 +92,10 @@ def hopping(tracker: Tracker, seconds: float = 8.0, yaw: float = 0.0, ways: Ways
         # The clip itself may end before the foot is lifted.
         clip = _hopping(tracker, ease, LIFTS_S[1] + 0.5, yaw, off, ways)
         frame = round(LIFTS_S[1] * clip.fps)
-        qpos = clip_to_qpos(clip.replaced(
-            root_pos=clip.root_pos[frame : frame + 3], rot=clip.rot[frame : frame + 3]
-        ), body.table)  # fmt: skip
+        qpos = clip_to_qpos(
+            clip.replaced(root_pos=clip.root_pos[frame : frame + 3], rot=clip.rot[frame : frame + 3]),
+            body.table,
+        )
         pose = Reference(body, [qpos], clip.fps, [clip.name]).pose
         off[:2] -= (pose.com[0] - pose.pos[0, foot])[:2].numpy()
     return _hopping(tracker, ease, seconds, yaw, off, ways)

@@ -228,9 +228,12 @@ def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[Sc
     clip = hopping(tracker, yaw=math.pi, ways=AT_SOMEBODY)
     task = weighed(imitation_of(tracker, [place(clip, tracker)]), scene.other, APART_M)
     felt = touches_of("back", "character", task.humanoid.bodies, f"{RIVAL}/")
-    task = replace(task, task=replace(
-        task.task, plugins=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
-    ))  # fmt: skip
+    task = replace(
+        task,
+        task=replace(
+            task.task, plugins=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
+        ),
+    )
     rival = Character(task.humanoid, RIVAL)
     return stage._replace(props=(rival,), touches=(*stage.touches, *felt)), task
 

@@ -184,9 +184,13 @@ class Compliant:
     # The paper's networks. Its rate of 1e-5, its gamma of .95 and its noise of 6 degrees are not taken:
     # this learns in minutes, over 33 control steps, with a noise of .3 of what an action may add.
     ppo: PPOConfig = PPOConfig(
-        policy_hidden=(256, 256, 256), value_hidden=(256, 256, 256), gamma=0.97, std=0.3,
-        policy_lr=3e-4, minibatch=512,
-    )  # fmt: skip
+        policy_hidden=(256, 256, 256),
+        value_hidden=(256, 256, 256),
+        gamma=0.97,
+        std=0.3,
+        policy_lr=3e-4,
+        minibatch=512,
+    )
 
     def __post_init__(self) -> None:
         validate(self, "compliant")
@@ -235,11 +239,18 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
     own = tuple(replace(r, weight=config.task_weight) for r in stage.rewards)
     dones: tuple[DoneTerm, ...] = (*base.dones, *stage.dones)
     return replace(
-        base, obs=(*base.obs, *seen(stage)), rewards=(*imitation, *own), dones=dones,
-        plugins=stage.plugins, compliance=stage.yields(config.given()), help_by="all", style=(),
-        first=1.0 if stage.from_start else base.first, horizon=round(config.seconds * rate_hz),
+        base,
+        obs=(*base.obs, *seen(stage)),
+        rewards=(*imitation, *own),
+        dones=dones,
+        plugins=stage.plugins,
+        compliance=stage.yields(config.given()),
+        help_by="all",
+        style=(),
+        first=1.0 if stage.from_start else base.first,
+        horizon=round(config.seconds * rate_hz),
         completion_bonus=0.0,
-    )  # fmt: skip
+    )
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Compliant:

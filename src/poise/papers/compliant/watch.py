@@ -1,4 +1,4 @@
-"""What is looked at while a scene is played: forces, what moves, how far goals gave way."""
+"""Observers of a scene while it is played: forces, moving things, how far goals gave way."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false
@@ -363,9 +363,11 @@ def _off(env: ImitationEnv) -> Tensor:
 
 
 METERS: Mapping[type[PlayScene], Callable[[], Meter]] = {
-    DoorScene: DoorMeter, TrampolineScene: TrampolineMeter, Balance: BallMeter,
+    DoorScene: DoorMeter,
+    TrampolineScene: TrampolineMeter,
+    Balance: BallMeter,
     Chicken: ChickenMeter,
-}  # fmt: skip
+}
 
 
 def meter_of(scene: PlayScene) -> Meter | None:

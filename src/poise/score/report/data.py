@@ -1,4 +1,4 @@
-"""What a report shows, and its compact, NaN-safe encoding for the page.
+"""The data of a report, and its compact, NaN-safe encoding for the page.
 
 Positions travel as float32 roots plus int16 offsets from the root (a tenth of a millimetre per
 step for a character within three metres of its root), quaternions as int16, both in base64.

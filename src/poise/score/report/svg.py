@@ -322,9 +322,10 @@ def pose_rows(
     out = [
         f'<svg class="pf" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" '
         f'width="{width:g}" height="{height:g}" role="img" aria-label="{escape(title, quote=True)}">',
-        _POSES_STYLE, '<rect class="bg" width="100%" height="100%" rx="10"/>',
+        _POSES_STYLE,
+        '<rect class="bg" width="100%" height="100%" rx="10"/>',
         f'<text class="t" x="16" y="26">{escape(title)}</text>',
-    ]  # fmt: skip
+    ]
     tall = max(float(row.pos[list(frames), :, 2].max()) for row in rows)
     scale = _SIZE / max(tall, 1e-6)
     for r, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""What a scene of compliance puts into each world, and what happens there."""
+"""The set-up of a scene of compliance in each world, and its events."""
 
 from __future__ import annotations
 
