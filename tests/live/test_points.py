@@ -18,16 +18,16 @@ from poise.env.stream import StreamGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.live import quats as q
+from poise.kinematics.retarget.passage import world_of
 from poise.live.characters import TRACKS
 from poise.live.commands import LiveConfig
-from poise.live.passage import world_of
 from poise.live.points import PointFit
 from poise.live.session import Live
 from poise.live.sockets import StreamDoor
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
+from poise.motion import quats as q
 from test_docs import ROOT, WALK
 
 STEP = 1 / 30

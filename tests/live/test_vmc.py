@@ -11,9 +11,8 @@ import pytest
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live import quats as q
+from poise.kinematics.retarget.passage import world_of
 from poise.live.commands import LiveConfig
-from poise.live.passage import world_of
 from poise.live.people import Calibration
 from poise.live.session import Live
 from poise.live.stream import Inbox
@@ -37,6 +36,7 @@ from poise.live.vmc import (
     to_unity,
 )
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 from refusals import refused
 from test_docs import WALK
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live import quats as q
 from poise.live.commands import (
     JOINTS,
     name,
@@ -24,6 +23,7 @@ from poise.live.commands import (
 )
 from poise.live.stream import PEOPLE, Inbox, Packet
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 
 #: s in which the end of a clip passes into its beginning.
 FADE_S = 0.4

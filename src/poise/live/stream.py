@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live.quats import normalized, slerp
 from poise.motion import Clip, Skeleton
+from poise.motion.quats import normalized, slerp
 
 #: Packets of one person that wait at most; the newest win.
 WAIT = 64

@@ -16,12 +16,12 @@ import numpy as np
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
-from poise.live import quats as q
-from poise.live.passage import FramePassage, local_of, world_of
+from poise.kinematics.retarget.passage import Retargeter, local_of, world_of
 from poise.live.people import Offset
 from poise.live.sockets import Listener
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 
 #: Bones with their parents, from the hips on; fingers, eyes and jaw are left out.
 PARENTS: dict[str, str | None] = {
@@ -403,7 +403,7 @@ class Puppet:
     ):
         self.skeleton = skeleton or standard()
         self._own, self._rot = example.skeleton, example.rot[0]
-        self._passage = FramePassage(example, t_pose(self.skeleton), scale)
+        self._passage = Retargeter.between(example, t_pose(self.skeleton), factor=scale)
         self._row = {row.joint: i for i, row in enumerate(table.rows)}
         self._above = set(self._own.ancestors(table.rows[0].joint))
 
@@ -430,7 +430,7 @@ class Puppet:
         path = [*own.ancestors(pelvis)[::-1], pelvis]
         for a, b in pairwise(path):
             root = root - q.rotate(world[a], own.offsets[b])
-        return self._passage.turned(root, q.normalized(world))
+        return self._passage(root, q.normalized(world))
 
 
 class Own(NamedTuple):
