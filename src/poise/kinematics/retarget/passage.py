@@ -197,10 +197,10 @@ def _plan_of(joints: JointMap, here: CommonPose, there: CommonPose, share: bool)
         _way_to(joints.source.skeleton, [a for a, _ in _hips(joints)]),
         _way_to(target, [b for _, b in _hips(joints)]),
     )
-    knots = np.array([bent[j][:2] for j in bent], dtype=int).reshape(-1, 2).T
+    low, high = np.array([b[:2] for b in bent.values()], dtype=int).reshape(-1, 2).T
     return _Plan(
         (np.array(list(direct), dtype=int), np.array(list(direct.values()), dtype=int)),
-        (np.array(list(bent), dtype=int), *knots, np.array([s for *_, s in bent.values()])),
+        (np.array(list(bent), dtype=int), low, high, np.array([s for *_, s in bent.values()])),
         None if 0 in done else there.above[0],
         hanging,
         ways,
