@@ -11,7 +11,7 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
-from poise.live.commands import LiveConfig
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live, generator_for
 from poise.live.sources import Loop, packet_of
 from poise.live.stream import Packet
