@@ -27,7 +27,7 @@ class TrackConfig:
     Attributes:
         noise, seed: what is done to the input first, see `motion.noise`.
         reset_on_fail: a character that failed is put back onto the reference.
-        recover: it gets up, comes back and goes on, while the motion waits, see `env.led`; for one
+        recover: it gets up, comes back and goes on, while the motion waits, see `env.recovery`; for one
             character.
         smooth_hz: cut-off of a low-pass on keypoints.
         count: characters that do the motion side by side in one world, see `track.crowd`.
