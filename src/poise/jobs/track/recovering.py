@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Reference
-from poise.env.led import TRACKS, LedGoal
+from poise.env.recovery.recovering import TRACKS, Recovering
 from poise.errors import PoiseError
 from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.tracker import Tracker
@@ -156,13 +156,13 @@ def led_along(
         zero = torch.zeros(1, dtype=torch.long)
         env.reset_to(zero, zero)
         how = tracker.recovery_clips, len(placed) > 1, returns
-        goal = LedGoal(env.goal.clips, *how)
+        goal = Recovering(env.goal.clips, *how)
         led = _Led(goal, env.reference.coordinates(zero, zero)[0], show)
         losses = (LOSSES + 1) * (len(placed) + led.total / (WITHIN_S * led.rate))
         most = led.total + int(losses * VAIN * AWAY_S * led.rate)
         obs = env.set_goal(goal)
         if ahead is not None:
-            ahead.copies.set_goal(LedGoal(ahead.copies.goal.clips, *how, plans=False))
+            ahead.copies.set_goal(Recovering(ahead.copies.goal.clips, *how, plans=False))
             ahead.watch(env)
         simulate(env, ahead or tracker.policy, obs, most, led)
     finally:
@@ -194,9 +194,9 @@ class _Led:
         spans: see `RecoveryRun`.
     """
 
-    def __init__(self, goal: LedGoal, start: Tensor, show: Callable[[int, int], None] | None = None):
+    def __init__(self, goal: Recovering, start: Tensor, show: Callable[[int, int], None] | None = None):
         self.goal, self.rate, self.show = goal, goal.rate_hz, show
-        self.last = (goal.reference.length - 1).tolist()
+        self.last = (goal.clips.reference.length - 1).tolist()
         self.total = sum(self.last)
         self.frames, self.of, self.actions = [start], [(0, 0)], list[Tensor]()
         self.lost, self.back, self.given_up = list[float](), list[float](), list[float]()
@@ -213,7 +213,7 @@ class _Led:
         if step:
             at = self._frame + 1 if self._here else self._frame
             self.actions.append(env.given.clone())
-            self.frames.append(self.goal.aimed())
+            self.frames.append(self.goal.aimed)
             self.of.append((clip, at))
             if self._here and at >= self.last[clip]:
                 self.spans[clip] = self.spans[clip][0], step
@@ -222,7 +222,7 @@ class _Led:
         if self.show is not None:
             self.show(sum(self.last[:clip]) + self._frame, self.total)
         was, self._here = self._here, int(self.goal.doing) == TRACKS
-        self._clip, self._frame = int(self.goal.clips.clip), int(self.goal.frame)
+        self._clip, self._frame = int(self.goal.clips.clip), int(self.goal.clips.frame)
         if self._clip != clip or self._frame > self._since + WITHIN_S * self.rate:
             self._losses, self._since = 0, self._frame
         self._left = now if was and not self._here else self._left
