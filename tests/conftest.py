@@ -45,8 +45,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.path.is_relative_to(here):
             inside = item.nodeid[len(item.nodeid.split("::")[0]) :]
             name = item.path.relative_to(here).as_posix() + inside
-                item.path.relative_to(here).as_posix() + item.nodeid[len(item.nodeid.split("::")[0]) :]
-            )
             for mark, beginnings in MARKS.items():
                 if name.startswith(beginnings):
                     item.add_marker(mark)
