@@ -201,6 +201,9 @@ def words(tree: ast.Module, imports: bool) -> Counter[str]:
             used.update(
                 a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)
             )
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # Tables of names and import paths: "poise.learn:PPOConfig".
+            used.update(re.findall(r"^poise[\w.]*:(\w+)$", node.value))
     return used
 
 
