@@ -27,7 +27,7 @@ T = TypeVar("T")
 SOURCES = {
     "residual-force": "poise.recipes.residual_force_settings:ResidualForce",
     "inbetween": "poise.jobs.inbetween.settings:Inbetween",
-    "perpetual": "poise.recipes.perpetual_settings:Perpetual",
+    "perpetual": "poise.papers.perpetual.ablations:StagedPerpetual",
     "endless": "poise.jobs.endless.training:Endless",
     "compliant": "poise.papers.compliant.training:Compliant",
 }
@@ -69,6 +69,7 @@ def _upper(text: str) -> str:
 
 def _plain_type(kind: type, name: str) -> Any:
     """The type of a setting without its None; those of other settings may need torch."""
+    kind = next(k for k in kind.__mro__ if name in vars(k).get("__annotations__", {}))
     one = SimpleNamespace(__annotations__={name: kind.__annotations__[name]})
     found = get_type_hints(one, vars(sys.modules[kind.__module__]))[name]
     others = [a for a in get_args(found) if a is not NoneType]
@@ -78,11 +79,12 @@ def _plain_type(kind: type, name: str) -> Any:
 def _texts(kind: type) -> dict[str, str]:
     """Each entry `name: text` of a docstring, on one line or of several."""
     names = "|".join(f.name for f in fields(kind))
-    flat = " ".join((kind.__doc__ or "").split())
-    parts = re.split(rf"(?:(?<=[.:] )|^)((?:{names})(?:, (?:{names}))*): ", flat)
     out: dict[str, str] = {}
-    for listed, text in zip(parts[1::2], parts[2::2], strict=True):
-        out |= dict.fromkeys(listed.split(", "), text.replace("`", "").strip())
+    for owner in kind.__mro__[-2::-1]:
+        flat = " ".join((owner.__doc__ or "").split())
+        parts = re.split(rf"(?:(?<=[.:] )|^)((?:{names})(?:, (?:{names}))*): ", flat)
+        for listed, text in zip(parts[1::2], parts[2::2], strict=True):
+            out |= dict.fromkeys(listed.split(", "), text.replace("`", "").strip())
     return out
 
 

@@ -17,7 +17,7 @@ from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.stage_order import Progress
+    from poise.jobs.perpetual.stages import Progress
     from poise.jobs.result import Result
     from poise.jobs.track import TrackConfig
     from poise.jobs.tracker import Tracker

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual.stage_order import Progress
+from poise.jobs.perpetual.stages import Progress
 from poise.jobs.result import LOST, TRACKED, Result
 from poise.jobs.run_file import RUN_FILE
 from poise.jobs.track import TrackConfig, track
