@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import LOST, Answer, launched, print_card, say, tell
-from poise.cli.options import Body, Chosen, Flag, InPlace, Reading, Training, places, printed
+from poise.cli.options import (
+    Body,
+    Chosen,
+    Force,
+    HoldFeet,
+    InPlaceMode,
+    Json,
+    Out,
+    Reading,
+    Training,
+    places,
+    printed,
+)
 from poise.cli.settings import given
 from poise.cli.track import follow
 from poise.cli.training import Shown, beginning, clock, command_line, left, stopped, summary
@@ -39,28 +51,20 @@ class Options:
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
-    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
-    into a folder of its name."""
+    out: Out
     going_on: Annotated[str | None, arg(name="from", metavar="POLICY|none", help_behavior_hint="")] = (
         None
     )
     """The policy that begins, a file or a run; by default the one that comes with Poise. none trains
     from nothing."""
-    in_place: InPlace = "auto"
-    """A clip that walks in place is learned with the travel that its feet tell. auto writes it in place
-    again, a loop as a loop; travel writes it with its travel; keep takes it as it is. What is learned
-    from nothing is written with its travel."""
-    hold_feet: Flag = True
-    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    in_place: InPlaceMode = "auto"
+    hold_feet: HoldFeet = True
+    force: Force = False
+    json: Json = False
+    training: OmitArgPrefixes[Training] = Training()
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
-    body: OmitArgPrefixes[Body] = field(default_factory=Body)
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+    body: OmitArgPrefixes[Body] = Body()
+    reading: OmitArgPrefixes[Reading] = Reading()
 
 
 #: Where no policy begins.
