@@ -51,7 +51,7 @@ live: $(VENV)/.installed
 # Two at once: fixtures of a file are made once.
 PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile
 test: $(VENV)/.dev
-	$(PYTEST) -m 'not (process or browser or learned or training or docs or benchmarks)'
+	$(PYTEST) -m 'not (process or browser or learned or training or data or docs or benchmarks)'
 
 test-all: $(VENV)/.dev
 	$(PYTEST) $(if $(DURATIONS),--durations=$(DURATIONS))
