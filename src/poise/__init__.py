@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from poise.jobs.endless.dreamt import Dream, Dreamt
     from poise.jobs.imitate import Imitated, imitate
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
-    from poise.jobs.inbetween.settings import Inbetween
+    from poise.jobs.inbetween.inbetween_settings import Inbetween
     from poise.jobs.open import Run, open_run
     from poise.jobs.push import push
     from poise.jobs.track import TrackConfig, Tracked, track
@@ -46,7 +46,7 @@ _PLACES = {
     "Dream": "poise.jobs.endless.dreamt",
     "Dreamt": "poise.jobs.endless.dreamt",
     "Imitated": "poise.jobs.imitate",
-    "Inbetween": "poise.jobs.inbetween.settings",
+    "Inbetween": "poise.jobs.inbetween.inbetween_settings",
     "Inbetweened": "poise.jobs.inbetween.fill",
     "Perpetual": "poise.recipes.perpetual",
     "ResidualForce": "poise.recipes",

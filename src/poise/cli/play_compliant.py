@@ -113,8 +113,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
     from poise.jobs.open import open_run
-    from poise.papers.compliant.play import play
-    from poise.papers.compliant.training import open_learned, shipped
+    from poise.papers.compliant.scene_play import play
+    from poise.papers.compliant.scene_training import open_learned, shipped
     from poise.plan import LookaheadConfig
 
     how = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)

@@ -17,7 +17,7 @@ from poise.errors import PoiseError
 from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.standing import ClipWorld
 from poise.learn.between import Between
-from poise.learn.inbetween import Adaptation, InbetweenModel, adapt
+from poise.learn.inbetween_model import Adaptation, InbetweenModel, adapt
 from poise.learn.transition import FilledGap, Known
 from poise.learn.transition import FilledGap as Transition
 from poise.motion.clip import Clip

@@ -14,7 +14,7 @@ from pathlib import Path
 from poise.errors import PoiseError
 from poise.formats import home_suffix, write_clip
 from poise.jobs.result import Result, ResultView, clip_of
-from poise.learn.inbetween import MODEL, InbetweenModel, load_model
+from poise.learn.inbetween_model import MODEL, InbetweenModel, load_model
 from poise.motion import Clip
 from poise.synthesis.filler import EACH_GAP, Filling, check_keyframes
 from poise.synthesis.inbetween import fill_keyframes
