@@ -285,7 +285,7 @@ def formats() -> str:
 
 def commands() -> str:
     """The commands of `/live`, with their fields."""
-    from poise.live.commands import COMMANDS
+    from poise.live.protocol import COMMANDS
 
     rows = ["| type | fields |", "|---|---|"]
     rows += [

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from poise.live.commands import COMMANDS, command, parse
-from poise.live.page.server import as_json
+from poise.live.protocol import COMMANDS, as_json, command, parse
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox
 from test_docs import ROOT
@@ -38,7 +37,7 @@ class Kept:
 
 def test_every_message_of_the_page_is_taken() -> None:
     inbox, kept = Inbox(), Kept()
-    stream, seen = JsonStream(inbox, "", kept), set[str]()
+    stream, seen = JsonStream(inbox, "", kept.offer), set[str]()
     for message in messages():
         kind, text = message["type"], json.dumps(message)
         seen.add(kind)

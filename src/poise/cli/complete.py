@@ -18,7 +18,7 @@ from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
-    from poise.jobs.complete import Completed
+    from poise.jobs.result import Result
     from poise.motion import Clip
 
 #: s outside the keyframes that are worth a sentence.
@@ -106,10 +106,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.cli.track import telling
     from poise.jobs.complete import complete
     from poise.jobs.open import open_run
+    from poise.jobs.result import story
     from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.tracked import story
     from poise.plan import LookaheadConfig
     from poise.synthesis.filler import check_keyframes
     from poise.synthesis.inbetween import partials_of, times_of
@@ -139,11 +139,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     _say(done)
     print_card(delivered.card)
     say(done.sentence)
-    became = story(done.tracked, hint=False)
+    became = story(done, hint=False)
     word = became.word if became.failed else "completed"
     result = {
         "outcome": word,
-        "controller": done.tracked.controller,
+        "controller": done.controller,
         "sentence": done.sentence,
         "keyframes": list(done.keyframes),
         "at": list(done.at),
@@ -201,12 +201,12 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     )
     result = {
         "outcome": "filled", "keyframes": list(asked), "at": list(keys),
-        "warnings": list(filled.warnings), "faults": [f.to_dict() for f in filled.faults],
+        "warnings": list(filled.filled.warnings), "faults": [f.to_dict() for f in filled.filled.faults],
     }  # fmt: skip
     return Answer(result, {"motion": path}, filled.notes, outcome="filled")
 
 
-def _say(done: Completed) -> None:
+def _say(done: Result) -> None:
     """The stages as a table."""
 
     def figure(value: float | None, digits: int = 0) -> str:

@@ -114,7 +114,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         if not done.paths:
             return Answer(exit_code=INTERRUPTED, outcome="interrupted")
         with working("writing"):
-            paths = done.write(out)
+            paths = done.write_score(out)
     _say(done)
     say(done.sentence)
     if done.interrupted:

@@ -19,7 +19,8 @@ from poise.jobs.keep import may_deliver
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stages import Progress
-    from poise.jobs.track import TrackConfig, Tracked
+    from poise.jobs.result import Result
+    from poise.jobs.track import TrackConfig
     from poise.jobs.tracker import Tracker
     from poise.learn import PolicyBundle, WarmStart
     from poise.motion import Clip
@@ -118,7 +119,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     may_deliver(out, motion, o.force or held, o.clip)
     nothing, t = from_nothing(o, run), o.training
     from poise.jobs.imitate import Job
-    from poise.jobs.track.tracked import story
+    from poise.jobs.result import story
 
     with Shown((o.clip,), o.reading, t, run, out) as shown:
         told = shown.watching(
@@ -134,36 +135,35 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             if made is None:
                 return Answer()
             with shown.doing("writing"):
-                done = made.deliver(out, motion, o.hold_feet)
+                done = made.write(out, motion, o.hold_feet)
         except KeyboardInterrupt:
             return stopped(run, again, shown.where)
     print_card(done.card)
     answer = Answer(done.card.to_dict(), {**done.paths, "run": run}, done.notes)
-    if made.tracked is None:
+    if made.placed is None:
         return answer
-    became, doubts = story(made.tracked, hint=False), made.tracked.doubts
+    became, doubts = story(made, hint=False), made.doubts
     for sentence in (*(doubts if became.failed else ()), became.sentence, *made.sentences):
         say(sentence)
     if became.failed or done.card.help.force_mean_n:
         say(f"Go on with --resume and --minutes {2 * t.minutes:g}.")
-    answer.notes, answer.outcome = (*made.tracked.notes, *done.notes), became.word
+    answer.notes, answer.outcome = (*made.notes, *done.notes), became.word
     if became.failed:
         answer.exit_code, answer.said = LOST, doubts
     return answer
 
 
-def tracks(shown: Shown, policy: Tracker, clip: Clip, config: TrackConfig) -> Tracked:
+def tracks(shown: Shown, policy: Tracker, clip: Clip, config: TrackConfig) -> Result:
     """Tracks, with bars of its own."""
     shown.close()
     return follow(policy, [clip], config, [])
 
 
-def first_result(first: Tracked, out: Path, motion: Path | None, hold: bool) -> None:
+def first_result(first: Result, out: Path, motion: Path | None, hold: bool) -> None:
     """Writes what is done before anything is learned, and says so."""
-    from poise.jobs.track import write
-    from poise.jobs.track.tracked import story
+    from poise.jobs.result import story
 
-    done = write(first, out, motion, hold)
+    done = first.write(out, motion, hold)
     tell(f"First result: {story(first, hint=False).sentence} See {done.paths['report']}")
 
 
@@ -173,13 +173,13 @@ def first_delivery(
     """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
 
     def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
-        from poise.jobs.deliver import deliver
+        from poise.jobs.result import Result
         from poise.jobs.runs import evaluate
         from poise.jobs.warm_start import FIRST_STARTS
 
         meta = {"seconds": start.seconds, "samples": start.samples}
         evaluation = evaluate(task, policy, meta, most=FIRST_STARTS)
-        paths = deliver(task, evaluation, out, {}, motion, hold).paths
+        paths = Result(task, evaluation).write(out, motion, hold).paths
         tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
 
     return deliver_first

@@ -83,7 +83,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             clip, keys, o.model, samples=o.samples, foot_lock=o.foot_lock, adapt=o.adapt, seed=o.seed,
             on_gap=count,
         )  # fmt: skip
-    for warning in filled.warnings:
+    for warning in filled.filled.warnings:
         tell(f"warning: {warning}.", "yellow")
     outputs = {"clip" if one else f"clip-{k}": path for k, path in enumerate(outs)}
     for made, path in zip(filled.clips, outs, strict=True):
@@ -93,8 +93,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         draw(clip, filled.clips, keys, o.picture)
         outputs["picture"] = o.picture
     result = {
-        "frames": clip.frames, "fps": clip.fps, "keyframes": keys, "warnings": filled.warnings,
-        "faults": [f.to_dict() for f in filled.faults],
+        "frames": clip.frames, "fps": clip.fps, "keyframes": keys, "warnings": filled.filled.warnings,
+        "faults": [f.to_dict() for f in filled.filled.faults],
     }  # fmt: skip
     return Answer(result, outputs, clip.skeleton.source.notes)
 

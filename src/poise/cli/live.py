@@ -86,7 +86,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         )
     from poise.jobs.open import open_run
     from poise.kinematics.travel import find_travel, travelled
-    from poise.live.commands import LiveConfig
+    from poise.live.protocol import LiveConfig
     from poise.live.session import Session, SessionConfig
     from poise.live.sockets import LOOPBACK
 

@@ -55,8 +55,8 @@ class Reading:
     """Frames per second."""
     unit: Annotated[str | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Metres in one unit of the file, 0.01 for example; or m, dm, cm, mm, in, ft."""
-    up: Annotated[Up | None, arg(metavar="Y|Z|-Y|-Z", help_behavior_hint="")] = None
-    """The file's vertical: Y, Z or X, with - where it points down."""
+    up: Annotated[Up | None, arg(metavar="Y|Z|X|-Y|-Z|-X", help_behavior_hint="")] = None
+    """The axis of the file that points up: Y, Z or X, with - where it points down."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
     """Which animation of a file that holds several (glTF, USD; by default the longest), or which of its
     people (TRC, C3D, CSV, arrays; by default the first)."""

@@ -83,8 +83,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     may_deliver(out, motion, o.overwrite, o.clip, flag="--overwrite")
     from poise.cli.track import follow
     from poise.jobs.open import open_run
-    from poise.jobs.track import TrackConfig, write
-    from poise.jobs.track.tracked import story
+    from poise.jobs.result import story
+    from poise.jobs.track import TrackConfig
 
     config = TrackConfig(
         seed=o.seed, controller=o.controller, threads=o.threads, body=o.body, push=push,
@@ -97,7 +97,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         said_early = list[str]()
         tracked = follow(tracker, [clip], config, said_early, "pushing")
         with working("writing"):
-            done = write(tracked, out, motion, o.hold_feet)
+            done = tracked.write(out, motion, o.hold_feet)
     assert tracked.pushed is not None
     print_card(done.card)
     became = story(tracked, hint=False)

@@ -18,7 +18,8 @@ from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stages import Progress
-    from poise.jobs.track import TrackConfig, Tracked
+    from poise.jobs.result import Result
+    from poise.jobs.track import TrackConfig
     from poise.jobs.tracker import Tracker
     from poise.kinematics.supports import Support
     from poise.motion import Clip
@@ -179,11 +180,11 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             "several characters make several files", motion, "Give a folder as -o", code="folder-needed"
         )
     from poise.jobs.open import open_run
-    from poise.jobs.track import TrackConfig, write
+    from poise.jobs.result import story
+    from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.tracked import story
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 
@@ -216,7 +217,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             if tracked is before:
                 tell("What was learned does it no better: the motion as it was before stays.")
         with working("writing"):
-            done = write(tracked, out, motion, o.hold_feet)
+            done = tracked.write(out, motion, o.hold_feet)
             if o.save_policy is not None:
                 save_tracker(tracker, o.save_policy)
     print_card(done.card)
@@ -270,7 +271,7 @@ def follow(
     config: TrackConfig,
     said: list[str],
     what: str = "tracking",
-) -> Tracked:
+) -> Result:
     """The motions as they are tracked, with a bar while it is looked ahead or searched. What speaks
     against a motion is told before it is simulated, and once: `said` is what was."""
     from poise.jobs.track import track
@@ -291,7 +292,7 @@ def telling(said: list[str]) -> Callable[[str], None]:
     return warn
 
 
-def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
+def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
     from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
@@ -318,7 +319,7 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
     return learned.tracker
 
 
-def advice(options: Options, tracked: Tracked) -> str:
+def advice(options: Options, tracked: Result) -> str:
     """What to do about a motion that was lost."""
     o = options
     if tracked.parts:
