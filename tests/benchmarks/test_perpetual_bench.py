@@ -16,14 +16,14 @@ import pytest
 import torch
 
 from poise.formats import write_clip
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.learn import ConvergenceConfig, Until
 from poise.learn.composer import Composer
 from poise.motion import ClipLibrary
 from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.recipes.body_shapes import BodyShapes, shaped
 from poise.recipes.perpetual import build, task
-from poise.recipes.shapes import BodyShapes, shaped
 from refusals import refused
 from toy_policy import PPO, toy_run, walk
 

@@ -11,7 +11,7 @@ import torch
 from poise.env.recovery.clips import CALM, QUICK
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
-from poise.jobs.perpetual.run import begin, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.perpetual.stages import Progress, Stage, demonstrations, odds, practised, staged
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
@@ -20,9 +20,9 @@ from poise.learn import Until, load_policy
 from poise.learn.composer import Composer
 from poise.papers.perpetual.ablations import StagedPerpetual, going_on
 from poise.papers.perpetual.primitive_stages import Owners
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build, standing
 from poise.recipes.perpetual_settings import WIDE
-from poise.recipes.shapes import BodyShapes
 from refusals import refused
 from toy_human import swing
 from toy_library import PLAIN, Scripted, library, lively, tiny

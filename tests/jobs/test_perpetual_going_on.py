@@ -12,7 +12,7 @@ import torch
 from poise.body import BodyConfig
 from poise.env.yielding import Yielding
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.jobs.warm_start import widened

@@ -16,7 +16,7 @@ from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import evaluation as perpetual_recovery
 from poise.jobs.perpetual.evaluation import RECOVERY_WORTH, StageRecord, back, check_falls, try_recovery
-from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.perpetual.stages import Progress, Stage, staged
 from poise.jobs.run_file import FINAL, RUN_FILE
 from poise.learn import Until, compose, first_column, load_checkpoint, load_policy, next_column

@@ -114,8 +114,8 @@ def run(
     for name in RESULTS:
         may_write(out / name, force, *([clip] if clip else []))
     from poise.jobs.open import open_run
-    from poise.papers.compliant.play import play
-    from poise.papers.compliant.training import open_learned, shipped
+    from poise.papers.compliant.scene_play import play
+    from poise.papers.compliant.scene_training import open_learned, shipped
     from poise.plan import LookaheadConfig
 
     how = LookaheadConfig() if budget is None else LookaheadConfig().with_budget(budget)

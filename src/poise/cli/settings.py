@@ -26,10 +26,10 @@ T = TypeVar("T")
 #: The dataclass of each recipe's settings.
 SOURCES = {
     "residual-force": "poise.recipes.residual_force_settings:ResidualForce",
-    "inbetween": "poise.jobs.inbetween.settings:Inbetween",
+    "inbetween": "poise.jobs.inbetween.inbetween_settings:Inbetween",
     "perpetual": "poise.papers.perpetual.ablations:StagedPerpetual",
-    "endless": "poise.jobs.endless.training:Endless",
-    "compliant": "poise.papers.compliant.training:Compliant",
+    "endless": "poise.jobs.endless.endless_training:Endless",
+    "compliant": "poise.papers.compliant.scene_training:Compliant",
 }
 _METAVARS = {float: "X", int: "N", str: "TEXT"}
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from poise.body import BodyTable, find_anatomy
-from poise.body.table import BodyRow, Geom
+from poise.body.body_table import BodyRow, Geom
 from poise.errors import PoiseError
 from poise.kinematics.forward import carried
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED

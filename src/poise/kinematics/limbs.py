@@ -232,9 +232,3 @@ def _turn(
     rot[:, limb.root] = quat_between(above(limb.root), quat_mul(swing, quat[:, limb.root]))
     rot[:, limb.mid] = quat_between(above(limb.mid), quat_mul(bend, quat[:, limb.mid]))
     rot[:, limb.end] = quat_between(quat_mul(both, above(limb.end)), quat[:, limb.end])
-
-
-def _direction(v: Tensor) -> Tensor:
-    """`v (..., 3)` at unit length; a zero vector points down."""
-    down = torch.tensor([0.0, 0.0, -1.0], dtype=v.dtype)
-    return torch.where(v.norm(dim=-1, keepdim=True) < 1e-12, down, normalize(v))

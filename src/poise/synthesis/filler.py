@@ -19,7 +19,7 @@ from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.standing import ClipWorld
 from poise.kinematics.steps import lock_feet, planted, stepped
 from poise.learn.between import Between
-from poise.learn.inbetween import Adaptation, InbetweenModel, adapt
+from poise.learn.inbetween_model import Adaptation, InbetweenModel, adapt
 from poise.learn.transition import FilledGap, Known
 from poise.learn.transition import FilledGap as Transition
 from poise.motion.clip import Clip

@@ -32,8 +32,8 @@ from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.opponents import opposing, rival_stage, weighed
+from poise.papers.compliant.scene_training import LearnedOnTop, Topped, seen
 from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
-from poise.papers.compliant.training import LearnedOnTop, Topped, seen
 from poise.papers.compliant.watch import Watch, meter_of, words_of
 from poise.plan import LookaheadConfig
 from poise.recipes.imitation import Imitation
