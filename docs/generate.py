@@ -28,7 +28,7 @@ MARK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Parts of the API page, in its order: a title, a package, its names.
 SHOWN: tuple[tuple[str, str, str], ...] = (
     ("Verbs", "poise", "read write track imitate push inbetween complete dream open_run"),
-    ("Results", "poise", "Tracked Imitated Completed Inbetweened Dreamt Run PoiseError"),
+    ("Results", "poise", "Result Dreamt Run PoiseError"),
     ("Settings", "poise", "TrackConfig ResidualForce Perpetual Inbetween Dream"),
     ("Motion", "poise.motion", "Clip ClipLibrary Skeleton trim resample"),
     ("Motion", "poise.formats", "read_clip write_clip"),
