@@ -156,9 +156,7 @@ def base_of(
         return from_toml(type(default), config, verb)
     if preset is None:
         return default
-    from poise.jobs.presets import preset_of
-
-    return preset_of(recipe, preset, clip)
+    return imported("poise.jobs.presets:preset_of")(recipe, preset, clip)
 
 
 def dotted(argv: Sequence[str]) -> list[str]:

@@ -31,7 +31,7 @@ from poise.cli.options import (
     each,
     places,
 )
-from poise.cli.training import clock, showing, staged, working
+from poise.cli.training import clock, left, showing, staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
@@ -296,7 +296,6 @@ def telling(said: list[str]) -> Callable[[str], None]:
 
 def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
-    from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
     from poise.learn import Until
 
@@ -305,7 +304,8 @@ def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) 
     with showing("learning") as bar:
 
         def show(p: Progress) -> None:
-            bar(p.share, f"{times(p)}  {p.stats.samples_per_s:,.0f} samples/s")
+            spent = f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)}"
+            bar(p.share, f"{spent}  {p.stats.samples_per_s:,.0f} samples/s")
             if p.results is not None:
                 came, whole = (float(x) / rate for x in (p.results.tracked, p.results.frames))
                 tell(f"{clock(p.stats.seconds)}  it gets to {came:.1f} of {whole:.1f} s")

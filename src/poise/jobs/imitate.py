@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from poise.errors import PoiseError
-from poise.jobs.keep import claimed
+from poise.jobs.keep import EVALUATING, claimed
 from poise.jobs.open import Run, open_run
-from poise.jobs.practice import EVALUATING, Watching, practise
+from poise.jobs.practice import Watching, practise
 from poise.jobs.result import RUN, Result, clip_of
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track.in_place import with_travel

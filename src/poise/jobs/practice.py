@@ -47,8 +47,6 @@ from poise.recipes.imitation import Imitation
 
 #: Start frames from which a motion is to be done before its training ends.
 STARTS = 32
-#: What `Watching.doing` is told last.
-EVALUATING = "simulating every start frame"
 #: The share of the minutes that training has at least, whatever looking for the motion takes.
 LEAST = 0.5
 
