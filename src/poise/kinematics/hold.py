@@ -19,7 +19,6 @@ from poise.kinematics.repair.support import FloorPoints, foot_slips
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import (
     axis_angle_to_quat,
-    forward_kinematics,
     quat_between,
     quat_distance,
     quat_mul,
@@ -104,9 +103,7 @@ def lead(
 
 def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]) -> Tensor:
     """The motion `(T, J, 4)` with the feet (by joint) led, their legs bent to follow, all else kept."""
-    pos, quat = forward_kinematics(
-        skeleton.parents, torch.tensor(skeleton.offsets, dtype=rot.dtype), root, rot
-    )
+    pos, quat = skeleton.forward(root, rot)
     goals: dict[int | str, Tensor] = {j: pos[:, j] + one.shift for j, one in leads.items()}
     touched = torch.zeros(len(rot), dtype=torch.bool)
     for one in leads.values():
@@ -213,11 +210,10 @@ def hold(
         fixed: `(T)` bool, frames that stay as they are.
         vertical: the heights of the soles' ends are held as well, with this share of their weight.
     """
-    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
     pinned = None if fixed is None else fixed.numpy()
     for _ in range(rounds):
         leads = {}
-        for foot, one in standing(*forward_kinematics(skeleton.parents, offsets, root, rot)).items():
+        for foot, one in standing(*skeleton.forward(root, rot)).items():
             flat = None if one.flat is None else one.flat.numpy()
             leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical, flat)
             if one.lift is not None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -332,6 +333,14 @@ def smoothed(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -
         share = gaussian_filter1d(share / share.sum(0), CHANGE_S * fps, axis=1, mode="nearest")
         out[:, mine] = (share[..., None] * stack).sum(0)
     return out
+
+
+Values = TypeVar("Values", np.ndarray, Tensor)
+
+
+def smoothstep(u: Values) -> Values:
+    """From 0 to 1 as `u` does, level at both ends."""
+    return u * u * (3.0 - 2.0 * u)
 
 
 def find_runs(bad: np.ndarray, gap: int) -> list[tuple[int, int]]:

@@ -25,7 +25,6 @@ from poise.learn.transition import FilledGap as Transition
 from poise.motion.clip import Clip
 from poise.motion.roles import map_joints
 from poise.motion.rotations import (
-    forward_kinematics,
     normalize,
     quat_between,
     quat_mul,
@@ -143,9 +142,7 @@ class OtherRig:
 
     @staticmethod
     def _passed(clip: Clip, passage: Retargeter, path: Motion) -> Motion:
-        skeleton = clip.skeleton
-        world = ClipWorld(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
-        rot, root = passage.transfer(world)
+        rot, root = passage.transfer(ClipWorld(*clip.skeleton.forward(*path)))
         return root, unwrap_quats(normalize(rot))
 
 

@@ -112,8 +112,7 @@ class PointBody:
 
     def _onto(self, performer: ClipWorld) -> tuple[Tensor, Tensor]:
         rot, root = self.passage.transfer(performer)
-        offsets = torch.tensor(self.onto.offsets)
-        pos, quat = forward_kinematics(self.onto.parents, offsets, root, rot)
+        pos, quat = self.onto.forward(root, rot)
         rows = [r.joint for r in self.table.rows]
         return pos[:, rows], quat[:, rows]
 
