@@ -25,7 +25,7 @@ from poise.motion.rotations import (
 )
 from poise.motion.smoothing import find_runs, gaussian, smooth_lift
 
-#: A (s) and B (1/s) of the module's text.
+#: A (s) and B (1/s) of `lead`.
 SMOOTH_S, RETURN_PER_S = 0.006, 0.6
 #: See `limbs.soft_reach`: feet that stand are kept in place by legs that may be nearly straight.
 SOFT = 0.003
@@ -53,7 +53,16 @@ def lead(
     vertical: float = 0.0,
     flat: np.ndarray | None = None,
 ) -> Lead:
-    """How a foot must be led; see the module's text.
+    """How a foot must be led so that its sole does not travel where it bears: a small smooth correction.
+
+    Both ends p of a sole are moved by a shift s of the foot and a turn psi about the vertical:
+
+        min  sum over frames dt [ sum over ends p  w_p |v_p + s' + psi' z x r_p|^2
+                                  + A^2 (|s''|^2 + L^2 psi''^2) + B^2 (|s|^2 + L^2 psi^2) ]
+
+    v_p is the horizontal velocity of an end, w_p how much it bears, r_p its place from the ankle and L
+    the length of the sole. B leaves slow drifts of long stances where they are, A lets a swinging foot
+    go back to its own path without a jerk.
 
     Args:
         weight: `(T - 1, 2)`, how much each end bears between frames.
@@ -412,12 +421,16 @@ ALIKE_S, LASTS_S = 0.1, 0.4
 TOLD_ROUNDS, SURE = 4, 3
 #: How long (s) an end stands at least that rolls as slowly as above.
 ROLLS_S = 0.3
-#: See the module's text: how much an end bears, at most, and how that grows.
+#: See `steadied`: how much an end bears, at most, and how that grows.
 BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 
 
 def steadied(clip: Clip, support: FloorPoints) -> Clip:
-    """The clip with its feet held while they stand; see the module's text."""
+    """The clip with its feet held while they stand: as firmly as noise is left in them, no more.
+
+    Feet roll and pivot where they stand. Beyond what they do, q, the speed s is noise: an end bears by
+    (s^2 / q^2 - 1) to the power of `STEEP`.
+    """
     stands, level, rise = stance(support)
     firm, upright = (float(_firm(s / q)) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
     rolls = np.maximum(ROLLS_S * support.fps / _lasting(stands), 1.0)
@@ -440,7 +453,15 @@ def steadied(clip: Clip, support: FloorPoints) -> Clip:
 
 def stance(support: FloorPoints) -> tuple[np.ndarray, float, float]:
     """How likely each end of a sole stands between frames `(T - 1, F)`, and the deviations of its level
-    speed (by axis) and of its rise while it does, m/s. Contacts that a file states stay."""
+    speed (by axis) and of its rise while it does, m/s. Contacts that a file states stay.
+
+    Level velocity, rise and height over the floor, y, are each normal, wider (S) while an end swings:
+
+        log p(y | stands) / p(y | swings) = sum  d ln(S / s) - |y|^2 (1 / s^2 - 1 / S^2) / 2,
+
+    and a chain of two states joins the frames. The s are those of the frames that stand, told again with
+    them: the more noise is left, the faster and the higher may an end be that stands.
+    """
     soles, fps = support.soles.numpy(), support.fps
     velocity = np.diff(soles, axis=0) * fps
     height = np.maximum(soles[1:, :, 2], soles[:-1, :, 2]) + support.fit.lift_m

@@ -190,6 +190,11 @@ class _Step(NamedTuple):
 class KeypointStream:
     """Keypoints one frame after another; goals at every control step that they reach.
 
+        body = PointBody.calibrate(first_seconds, humanoid_skeleton, humanoid.table)
+        stream = KeypointStream(body, rate_hz=30.0)
+        for frame in stream.follow(points):     # or: stream.push(positions, time_s) for every frame
+            frame.pos, frame.linvel             # (B, 3) m and m/s
+
     latency_s: how long after a control step its goal is given: until the next frame of the input is
     there, and `lookahead` steps more. The filter adds none at constant velocity.
     """
