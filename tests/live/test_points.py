@@ -20,10 +20,11 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics.retarget.passage import world_of
 from poise.live.characters import TRACKS
+from poise.live.points import PointFit
 from poise.live.protocol import LiveConfig
 from poise.live.session import Live
 from poise.live.sockets import StreamDoor
-from poise.live.sources import JsonStream, KeypointFrame, PointFit
+from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
 from poise.motion import quats as q
