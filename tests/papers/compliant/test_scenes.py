@@ -157,7 +157,7 @@ def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> Non
     ctrl = sim.backend.drive.ctrl[:, place.controls]
     up = list[int]()
     for step in range(150):
-        bounce.before()
+        bounce.before_step(sim.backend.drive)
         if bool((ctrl == 0.1).all()):
             up.append(step)
         else:
