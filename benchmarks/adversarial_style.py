@@ -43,7 +43,7 @@ def lesson(tracker: Tracker, clips: Sequence[Clip], worlds: int, seed: int) -> I
     task = imitation_of(tracker, [place(c, tracker) for c in clips])
     push = Pushes((10.0, 60.0), (0.5, 1.5), 0.3, task.humanoid.rows_of("hand"), seed=seed)
     own = replace(
-        task.task, plugins=(*task.task.plugins, push), compliance=Compliance(LEVEL),
+        task.task, events=(*task.task.events, push), compliance=Compliance(LEVEL),
         style=style_terms(task.humanoid),
     )  # fmt: skip
     return as_lesson(tracker, task, own, worlds, seed)

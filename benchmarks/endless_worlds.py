@@ -101,7 +101,7 @@ def rollouts(
         pasts=torch.cat(begins), steering=Steering(targets), simulated=past == "simulated",
     )  # fmt: skip
     goal = Recovering(motion, tracker.recovery_clips if recover else None)
-    goal.draw(torch.arange(count))
+    goal.reset(torch.arange(count))
     width = tracker.humanoid.model.nq
     empty = np.zeros((2, count, steps, width), np.float32)
     out = Rollouts(empty[0], empty[1], 0, [], [], [])

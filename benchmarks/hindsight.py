@@ -50,7 +50,7 @@ def lesson(tracker: Tracker, clips: Sequence[Clip], worlds: int, seed: int) -> I
     task = imitation_of(tracker, [place(c, tracker) for c in (still, still, *clips)])
     push = Pushes(NEWTONS, EVERY_S, LASTS_S, task.humanoid.rows_of("hand"), seed=seed)
     own = replace(
-        task.task, plugins=(*task.task.plugins, push),
+        task.task, events=(*task.task.events, push),
         compliance=Stiffness(ASKED, hindsight=True),
     )  # fmt: skip
     return as_lesson(tracker, task, own, worlds, seed)

@@ -41,6 +41,7 @@ WAYS: tuple[tuple[float | None, float, bool], ...] = (
     (None, 0.2, False), (None, 0.4, False), (None, 0.8, False), (0.03, 0.4, False),
     (None, 0.8, True),
 )  # fmt: skip
+EVERYTHING = slice(None)
 #: Pairs of opposite displacements over which answers are averaged.
 PAIRS = 6
 #: Frames of a spectrum's window.
@@ -50,11 +51,9 @@ WINDOW = 30
 class Averaged:
     """A policy whose answers are means over normal noise on what it observes."""
 
-    def __init__(
-        self, policy: PolicyBundle, noise: float, seed: int, over: tuple[int, int] | None = None
-    ):
+    def __init__(self, policy: PolicyBundle, noise: float, seed: int, over: slice = EVERYTHING):
         self.policy, self.noise = policy, torch.zeros_like(policy.norm.std)
-        columns = slice(*over) if over else slice(None)
+        columns = over
         self.noise[columns] = noise * policy.norm.std[columns]
         self.rng = torch.Generator().manual_seed(seed)
 
@@ -93,7 +92,9 @@ def measure(
     length, fps = imitation.reference.length, imitation.reference.rate_hz
     every, first = torch.arange(len(length)), torch.zeros(len(length), dtype=torch.long)
     env = imitation.bare().env(len(length), None, False, 1, None, 0.0, guard=False)
-    over = imitation.task.velocities if velocities else None
+    names, over = imitation.task.velocities, EVERYTHING
+    if velocities and names:
+        over = slice(env.columns[names[0]].start, env.columns[names[-1]].stop)
     policy = Averaged(tracker.policy, noise, seed, over) if noise else tracker.policy
     judge, path = ClipJudge(length - 1), Places()
     try:

@@ -18,7 +18,7 @@ import torch
 from mujoco.batch import Batch
 
 from poise.env import ImitationEnv
-from poise.env.plugins import Plugin
+from poise.env.events import Event
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
@@ -29,10 +29,13 @@ ROWS, STEPS, REPEATS = 64, 40, 15
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
-class Force(Plugin):
+class Force(Event):
     """30 N on the root of every character, added anew before each physics step."""
 
-    def push_substep(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
+        return True
+
+    def before_substep(self, drive: Drive) -> None:
         drive.xfrc_applied[:, 1, 1] += 30.0
 
 
@@ -94,8 +97,8 @@ def environments(tracker: Tracker) -> dict[str, dict[str, float]]:
     """Stepping and whole control steps of environments, without and with a force in every world."""
     task = imitation_of(tracker, [place(tracker.example, tracker)])
     found: dict[str, dict[str, float]] = {}
-    for name, plugins in (("", ()), (", force each physics step", (lambda goal, backend: Force(),))):
-        own = replace(task, task=replace(task.task, plugins=plugins, help_by="all"))
+    for name, events in (("", ()), (", force each physics step", (lambda goal, backend: Force(),))):
+        own = replace(task, task=replace(task.task, events=events, help_by="all"))
         env = own.env(ROWS, auto_reset=False, threads=1, help_scale=0.0)
         raw, still = Raw(env.backend, env.substeps), torch.zeros(ROWS, env.num_actions)
         zero = torch.zeros(ROWS, dtype=torch.long)

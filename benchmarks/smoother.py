@@ -129,9 +129,9 @@ def main() -> None:
         hard = its & ~own
         print(f"{int(own.sum())} of {len(library)} clips done, {int(hard.sum())} more by the other")
     env = task.env(a.worlds, a.seed, threads=a.threads or 1, help_scale=0.0, guard=False)
-    assert task.task.velocities is not None
     noise = torch.zeros(env.num_obs)
-    noise[slice(*task.task.velocities)] = a.noise
+    for name in task.task.velocities:
+        noise[env.columns[name]] = a.noise
     if hard.any():
         odds = env.weights
         env.weights = torch.where(hard, SHARE / odds[hard].sum(), (1 - SHARE) / odds[~hard].sum()) * odds

@@ -21,7 +21,7 @@ from poise.env import TaskConfig
 from poise.env.generator import Steering
 from poise.env.pushes import Push, Pushes
 from poise.env.recovery.clock import Recovery
-from poise.env.things import Throw
+from poise.env.scene import Throw
 from poise.errors import PoiseError
 from poise.jobs.inbetween.inbetween_training import Inbetween
 from poise.jobs.track.direction import Weight

@@ -298,7 +298,7 @@ def test_a_stream_goal_takes_places(tracker: Tracker) -> None:
     assert tracker.recovery_clips is not None
     ease, bodies = tracker.recovery_clips.ease, len(tracker.humanoid.bodies)
     goal.push(ease)
-    goal.draw(torch.arange(2))
+    goal.reset(torch.arange(2))
     places = torch.full((2, bodies, 3), torch.nan)
     places[1] = torch.randn(bodies, 3, generator=torch.Generator().manual_seed(0))
     goal.push(ease.expand(2, -1), places=places)

@@ -61,7 +61,7 @@ def test_what_is_on_top_adds_to_what_is_below(tracker: Tracker) -> None:
     given = env.given.clone()
     given[1, 0] -= 0.05
     torch.testing.assert_close(given, below, atol=1e-5, rtol=1e-5)
-    forces = env.plugin(FictionalForces)
+    forces = env.event(FictionalForces)
     assert forces is not None and forces.asked is not None and forces.asked[1].tolist()[1] == 1.0
     top.close()
 

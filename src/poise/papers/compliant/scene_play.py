@@ -184,8 +184,8 @@ def play(
         given = learned.config.given()
     for compliance in (stage.yields(given), None):
         others = () if rival is None else (opposing(rival, tracker, compliance),)
-        plugins = (*stage.plugins, *others)
-        own = replace(task.task, plugins=plugins, compliance=compliance, help_by="all")
+        events = (*stage.events, *others)
+        own = replace(task.task, events=events, compliance=compliance, help_by="all")
         top = None if compliance is None else learned
         if top is not None:
             own = replace(own, obs=(*own.obs, *seen(stage)))

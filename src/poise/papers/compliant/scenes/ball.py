@@ -14,13 +14,12 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, RandomEvent
+from poise.env.events import EpisodeStart, Event, Felt, Force
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
-from poise.env.plugins import Felt, Plugin
 from poise.env.pushes import Pushes
 from poise.env.reference import Reference
-from poise.env.things import Switch, near
+from poise.env.scene import InScene, RandomEvent, Switch, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
@@ -178,7 +177,8 @@ class _Tilted(RandomEvent):
         super().__init__(event.seed)
         self._event, self._sim = event, sim
 
-    def begin(self, worlds: Tensor) -> None:
+    def begin(self, episodes: EpisodeStart) -> None:
+        worlds = episodes.worlds
         half = 0.5 * self.between(-self._event.spread, self._event.spread, len(worlds), 2)
         qpos = torch.zeros(len(worlds), 7, dtype=torch.float64)
         qpos[:, :3], qpos[:, 3] = torch.tensor(self._event.rod.pos), 1.0
@@ -191,7 +191,7 @@ class _Tilted(RandomEvent):
 
 @dataclass(frozen=True)
 class Fictional:
-    """The fictional forces of `Balance`, as a plug-in.
+    """The fictional forces of `Balance`, as an event.
 
     Attributes:
         given: the scene.
@@ -201,14 +201,14 @@ class Fictional:
     given: Balance
     head: int
 
-    def __call__(self, goal: Goal, backend: Backend) -> Plugin:
-        """The plug-in of an environment."""
+    def __call__(self, goal: Goal, backend: Backend) -> Event:
+        """The event of an environment."""
         if not isinstance(backend, CharacterRows) or backend.sim is None:
             raise PoiseError("'ball' needs the worlds of its scene", "ball", code="scene-needed")
         return FictionalForces(self, backend, backend.sim, goal)
 
 
-class FictionalForces(Plugin):
+class FictionalForces(Force):
     """The fictional forces in N worlds.
 
     Attributes:
@@ -223,10 +223,7 @@ class FictionalForces(Plugin):
         self._body = torch.tensor([given.head + 1, 1], device=like.device).repeat(rows.num_envs, 1)
         self._force = like.new_zeros(rows.num_envs, 2, 3)
 
-    def follow(self, goal: Goal) -> None:
-        self._goal = goal
-
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """A control step begins: sets the forces that are held for it."""
         law = self._given.given
         off, moves = tipped(self._sim, law.length)
@@ -241,6 +238,7 @@ class FictionalForces(Plugin):
             force = force + quat_rotate(heading.to(local).expand(-1, 2, -1), local)
         size = force.norm(dim=-1, keepdim=True)
         self._force = force * (MOST_N / size.clamp_min(MOST_N))
+        return False
 
     def _head(self) -> Tensor:
         """`(N, 3)` where the head would be without giving way, m."""

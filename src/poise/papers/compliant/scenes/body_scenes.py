@@ -16,14 +16,14 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.env.events import Happening, InScene, ScenePart, touches_of
+from poise.env.events import EpisodeStart, Event
 from poise.env.pushes import Push
 from poise.env.reference import Reference
-from poise.env.things import Move, SetDown, Switch, Throw, always
+from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
 from poise.errors import PoiseError
 from poise.papers.compliant.scenes.stage import Given, SceneSetup, as_given, hand_of
 from poise.settings import Checked, Positive, Range, validate
-from poise.sim import Link, Plane, SceneSim, Touch
+from poise.sim import Drive, Link, Plane, SceneSim, Touch
 from poise.sim.props import Ball, Box, Carrier, Vector, solid
 
 
@@ -174,7 +174,7 @@ class PullScene:
         x, y, z = (float(self.newtons * v) for v in unit)
         rate = reference.rate_hz
         steps = max(1, round(self.lasts_s * rate))
-        return SceneSetup(plugins=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
+        return SceneSetup(events=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ def stands_still(given: Given | None) -> Given:
 
 def after_contact(part: ScenePart, force: Tensor) -> Tensor:
     """A force where the character gives way just now, else 0."""
-    bounce = next(h for h in part.happenings if isinstance(h, Bouncing))
+    bounce = next(h for h in part.events if isinstance(h, Bouncing))
     return force * (bounce.gives > 0).to(force).unsqueeze(1)
 
 
@@ -335,12 +335,12 @@ class Bounce:
     touches: tuple[str, ...]
     first: float = 1.0
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
+    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
         """The event in the worlds of a scene."""
         return Bouncing(self, sim, control_hz)
 
 
-class Bouncing(Happening):
+class Bouncing(Event):
     """`Bounce` in N worlds.
 
     Attributes:
@@ -361,17 +361,19 @@ class Bouncing(Happening):
     def rows(self) -> dict[str, Tensor]:
         return {"steps": self.steps, "gives": self.gives, "air": self.air}
 
-    def begin(self, worlds: Tensor) -> None:
+    def begin(self, episodes: EpisodeStart) -> None:
+        worlds = episodes.worlds
         for value in (self.steps, self.gives, self.air):
             value[worlds] = 0
 
-    def before(self) -> None:
+    def before_step(self, drive: Drive) -> bool:
         since = self.steps / self._hz - self._event.first
         up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
-        drive = self._sim.backend.drive.ctrl
-        drive[:, self._controls] = self._event.height * up.to(drive).unsqueeze(1)
+        ctrl = self._sim.backend.drive.ctrl
+        ctrl[:, self._controls] = self._event.height * up.to(ctrl).unsqueeze(1)
+        return False
 
-    def after(self) -> None:
+    def after_step(self) -> None:
         self.steps += 1
         force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self._event.touches)
         stands = torch.as_tensor(force) > CONTACT_N
