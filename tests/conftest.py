@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from marks import MARKS
 
 torch.set_num_threads(1)

@@ -41,7 +41,8 @@ MARKS = {
     ),
     "data": (
         "formats/test_motion_index.py", "jobs/test_perpetual_data.py::test_real_clips",
-        "score/test_inbetween_protocol.py::test_bandai", "score/test_inbetween_protocol.py::test_the_lafan1",
+        "score/test_inbetween_protocol.py::test_bandai",
+        "score/test_inbetween_protocol.py::test_the_lafan1",
     ),
     "docs": (
         "test_docs.py::test_python_snippets_run", "test_docs_commands.py", "test_notebooks.py",

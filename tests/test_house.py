@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
 from marks import MARKS
 
 ROOT = Path(__file__).resolve().parents[1]
