@@ -18,9 +18,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     for item in items:
         if item.path.is_relative_to(here):
-            name = (
-                item.path.relative_to(here).as_posix() + item.nodeid[len(item.nodeid.split("::")[0]) :]
-            )
+            inside = item.nodeid[len(item.nodeid.split("::")[0]) :]
+            name = item.path.relative_to(here).as_posix() + inside
             for mark, beginnings in MARKS.items():
                 if name.startswith(beginnings):
                     item.add_marker(mark)

@@ -1,9 +1,8 @@
-"""What is costly and always the same, such as a toy policy, is made once and kept for later tests.
+"""What is costly and always the same, such as a trained toy policy, is made once and kept for later.
 
 It lies in a folder under the system's temporary one, by a digest of the sources of Poise and of the
 tests' helpers, of the versions of torch and MuJoCo and of what is asked for; so a changed line makes it
-anew.
-Processes that want the same wait for the first.
+anew. Processes that want the same wait for the first.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def toy_run(folder: Path, goal: str = "rotations") -> Path:
 def _trained(folder: Path, goal: str) -> None:
     library = ClipLibrary.of([walk(0, 30, "first"), walk(25, 60, "second")])
     plain = {"num_envs": 8, "evaluate_every": 100, "seed": 1, "expert": False, "style": None}
-    sizes = {"single": True, "single_hidden": (24, 16), "ppo": PPO, "goal": goal}
+    sizes = {"single_hidden": (24, 16), "ppo": PPO, "goal": goal}
     config = Perpetual(**(plain | sizes))  # type: ignore[arg-type]
     imitation = perpetual_run.begin(folder, library, config)
     perpetual_run.train(imitation, folder, Until(iterations=3), threads=1, tensorboard=False)

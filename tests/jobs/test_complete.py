@@ -245,7 +245,7 @@ def test_a_config_keeps_its_own_lookahead(tracker: Tracker) -> None:
 
     config = TrackConfig(lookahead=FEW, controller="policy")
     done = complete(swing(1.0), (0, 29), tracker, replace(config, threads=1), adapt=0)
-    assert done.tracked.controller == "policy"
+    assert done.controller == "policy"
 
 
 def test_a_tremble_is_taken_off_before_keyframes_are_filled_between(

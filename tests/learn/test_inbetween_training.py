@@ -18,8 +18,8 @@ from poise.learn.inbetween import (
     save_model,
     train_inbetween,
 )
-from poise.learn.rtn import RTNObjective, RTNTraining
 from poise.learn.windows import Sampler
+from poise.papers.skeleton2humanoid.rtn import RTNObjective, RTNTraining
 from refusals import refused
 from toy_windows import SMALL, SMALL_RTN, bank, data
 

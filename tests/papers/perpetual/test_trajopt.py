@@ -11,8 +11,7 @@ import torch
 
 from poise.env import ImitationEnv, Reference
 from poise.metrics import mpjpe_global
-from poise.plan import LqrTeacher, TrajectoryOptimizer, TrajOptConfig
-from poise.plan.trajopt import segments
+from poise.papers.perpetual.trajopt import LqrTeacher, TrajectoryOptimizer, TrajOptConfig, segments
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
 from poise.sim import SimConfig
@@ -62,7 +61,7 @@ def _exact(s: TrajectoryOptimizer) -> list[tuple[str, torch.Tensor]]:
 def test_clips_are_found_as_if_each_were_alone(make_task, monkeypatch: pytest.MonkeyPatch) -> None:
     clips = swing(0.5, name="calm"), swing(0.6, speed=1.0, name="walk")
     together = search(make_task(*clips))
-    monkeypatch.setattr("poise.plan.trajopt.ROWS", 5)
+    monkeypatch.setattr("poise.papers.perpetual.trajopt.ROWS", 5)
     apart = search(make_task(*clips))
     assert len(together._parts()) == 1 or len(apart._parts()) == 2
     together.iterate()

@@ -18,8 +18,8 @@ from poise.env.env import ImitationEnv
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
+from poise.papers.perpetual.lqr import Regulator, driven, linearise, regulate
 from poise.plan.expert import ExpertConfig, make_plan
-from poise.plan.lqr import Regulator, driven, linearise, regulate
 from poise.settings import Limit, Positive, Range, validate
 from poise.sim import CpuBackend, SimConfig, alone, difference
 
@@ -30,7 +30,7 @@ class TrajOptConfig:
 
     Attributes:
         iterations: number of iterations; 0 optimises nothing.
-        sizes: rad, of the differences in the first and in the last iteration, see `plan.lqr`.
+        sizes: rad, of the differences in the first and in the last iteration, see `lqr`.
         segment_s: seconds of a shooting segment; each segment chooses its own step.
         place_m: m, error of the root's place that costs 1.
         turn: rad, error of the root's attitude that costs 1.

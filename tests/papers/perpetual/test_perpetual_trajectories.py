@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from poise.jobs.perpetual.run import begin, train
-from poise.jobs.perpetual.stage_start import PATHS
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
 from poise.motion import ClipLibrary
-from poise.plan import TrajOptConfig, TrajOptStats
+from poise.papers.perpetual.primitive_stages import PATHS
+from poise.papers.perpetual.trajopt import TrajOptConfig, TrajOptStats
 from poise.recipes.perpetual_settings import config_of
 from poise.recipes.shapes import BodyShapes
 from poise.settings import to_data
