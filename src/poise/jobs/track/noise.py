@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.track.settings import Controller, TrackConfig
 from poise.jobs.track.tracking import track
+from poise.jobs.track_settings import Controller, TrackConfig
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip
