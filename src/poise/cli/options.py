@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from poise.body import BodyConfig
     from poise.learn import Until
     from poise.motion import Clip
+    from poise.plan import LookaheadConfig
 
     Chosen: TypeAlias = Any
 else:
@@ -52,20 +53,7 @@ _POLICY = """A policy file, the folder of a run of poise train perpetual, or key
 comes along and is told places alone; by default the one for rotations that comes with Poise."""
 PolicyFile = Annotated[Path | None, _option(" ".join(_POLICY.split()), "FILE|RUN")]
 Threads = Annotated[int, arg(metavar="N", help="Cores; 0 is all.")]
-_BUDGET = """Simulated control steps of lookahead for each that is made, by default 192, or 768 for
-keyframes. More are nearer and cleaner, and take longer."""
-Budget = Annotated[float | None, _option(" ".join(_BUDGET.split()), "STEPS")]
-_WEIGHT = "Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."
-Texts: TypeAlias = UseAppendAction[tuple[str, ...]]
-Weights = Annotated[Texts, arg(metavar="PART=FACTOR[:A-B]", help=_WEIGHT)]
-_PIN = "Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."
-Pins = Annotated[Texts, arg(metavar="LIMB:A-B", help=_PIN)]
-_TOUCH = "Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."
-Touches = Annotated[Texts, arg(metavar="LIMB:FRAME:X,Y,Z", help=_TOUCH)]
-_SPAN = "Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."
-Span = Annotated[str | None, _option(_SPAN, "A-B", name="range")]
-_FROM = "The folder of an earlier result of the same motion, for --range."
-Earlier = Annotated[Path | None, _option(_FROM, "RESULT", name="from")]
+Budget = Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")]
 _PLACE = """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
 place again, a loop as a loop; travel writes it with its travel; keep simulates it as it is."""
 InPlaceMode = Annotated[Literal["auto", "keep", "travel"], arg(help=" ".join(_PLACE.split()))]
@@ -162,6 +150,51 @@ class Reading:
                 code="option-malformed",
             )
         return height
+
+
+Texts: TypeAlias = UseAppendAction[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Directing:
+    """What a director wants of a motion, and how well it is looked for."""
+
+    weight: Annotated[Texts, arg(metavar="PART=FACTOR[:A-B]")] = ()
+    """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
+    pin: Annotated[Texts, arg(metavar="LIMB:A-B")] = ()
+    """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
+    touch: Annotated[Texts, arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
+    """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
+    span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
+    """Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
+    earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
+    """The folder of an earlier result of the same motion, for --range."""
+    budget: Budget = None
+    """Simulated control steps of lookahead for each that is made, by default 192, or 768 for keyframes.
+    More are nearer and cleaner, and take longer."""
+
+    def values(self) -> dict[str, Any]:
+        """What is stated, as settings of `TrackConfig`.
+
+        Raises:
+            PoiseError: words that make no sense.
+        """
+        from poise.jobs.track.direction import direction_of
+        from poise.jobs.track.simulation import retake_of
+
+        return {
+            "direction": direction_of(self.weight, self.pin, self.touch),
+            "retake": retake_of(self.span, self.earlier),
+            "lookahead": lookahead_of(self.budget),
+        }
+
+
+def lookahead_of(budget: float | None) -> LookaheadConfig:
+    """Lookahead with so many simulated control steps for each that is made."""
+    check_range("budget", budget, 1, 1_000_000)
+    from poise.plan import LookaheadConfig
+
+    return LookaheadConfig() if budget is None else LookaheadConfig().with_budget(budget)
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,13 @@ SOURCES = {
     "endless": "poise.jobs.endless.endless_training:Endless",
     "compliant": "poise.papers.compliant.scene_training:Compliant",
 }
+#: The dataclass of how a motion is tracked.
+TRACK = "poise.jobs.track_settings:TrackConfig"
 _METAVARS = {float: "X", int: "N", str: "TEXT"}
 
 
 def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
-    """A frozen dataclass of options for the fields `names` of a recipe's settings.
+    """A frozen dataclass of options for the fields `names` of settings: of a recipe, or at a place.
 
     A field that the command line does not state is None, or for a switch its default, so that
     `given` knows what was stated.
@@ -46,7 +48,7 @@ def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
     """
     from tyro.conf import arg
 
-    kind = imported(SOURCES[recipe])
+    kind = imported(SOURCES.get(recipe, recipe))
     texts, made = _texts(kind), []
     for name in (*names, *flags):
         type_, default, text = _plain_type(kind, name), getattr(kind, name), texts[name]

@@ -24,7 +24,7 @@ from poise.jobs.practice import Watching, practise
 from poise.jobs.result import RUN, Result, clip_of
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track.in_place import with_travel
-from poise.jobs.track.settings import Mode
+from poise.jobs.track_settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, RunResult, Until

@@ -38,7 +38,7 @@ from poise.jobs.track.learning import (
     with_help,
 )
 from poise.jobs.track.placement import place
-from poise.jobs.track.settings import Mode
+from poise.jobs.track_settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, Until

@@ -18,7 +18,7 @@ from poise.motion import Clip
 from poise.recipes.imitation import Imitation
 
 if TYPE_CHECKING:
-    from poise.jobs.track.settings import TrackConfig
+    from poise.jobs.track_settings import TrackConfig
 
 
 #: The rates that a lost motion is tried at, over its own, if files have them within `USUAL`.

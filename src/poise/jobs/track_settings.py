@@ -36,7 +36,7 @@ class TrackConfig:
         seed: seed of the noise, and of what lookahead and search draw.
         reset_on_fail: put a character that is 0.5 m off back onto the motion, and go on.
         recover: a character that is 0.5 m off gets up, walks back and goes on where the motion waits for
-            it, see `env.recovery`.
+            it.
         smooth_hz: cut-off of a low-pass on keypoints.
         count: characters that do the motion side by side in one world, where they may collide.
         controller: policy acts alone, at once; lookahead tries in copies of the character before it
