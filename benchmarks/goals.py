@@ -25,8 +25,8 @@ import poise
 from poise.env import ImitationEnv
 from poise.env.generator import GeneratorGoal
 from poise.env.goal import ClipGoal, Goal
-from poise.env.led import LedGoal
 from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.recovering import Recovering
 from poise.env.stream import StreamGoal
 from poise.env.task import goal_of
 from poise.env.yielding import DisplacedGoal
@@ -69,7 +69,7 @@ def goal_for(kind: str, task: Imitation, env_goal: ClipGoal) -> Goal:
         goal.offset[:, 0] = 0.05
         return goal
     if kind == "led":
-        return LedGoal(env_goal, RecoveryClips(qpos[0], (qpos,), (qpos,)))
+        return Recovering(env_goal, RecoveryClips(qpos[0], (qpos,), (qpos,)))
     return env_goal
 
 

@@ -35,6 +35,7 @@ from poise.jobs.run_file import RUN_FILE
 from poise.jobs.warm_start import widened
 from poise.learn import AmpConfig, LessonConfig, Until
 from poise.motion import ClipLibrary
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.plan import TeacherConfig
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import Perpetual
@@ -89,7 +90,9 @@ ROWS = (*LADDER, *MORE, *UHC, *INGREDIENTS, *TAUGHT)
 
 def settings(name: str, seed: int) -> Perpetual:
     """One run's."""
-    additive = Perpetual.additive(help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed)
+    additive = StagedPerpetual.additive(
+        help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed
+    )
     # A small library has fewer hard moments, and the budget is small.
     additive = replace(additive, num_envs=512)
     ppo = replace(additive.ppo, minibatch=2048)

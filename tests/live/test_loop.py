@@ -300,7 +300,7 @@ def test_whole_turns_of_a_fallen_character_are_left_out(tracker: Tracker, walk: 
     before = state.xpos.clone()
     world._unwind()
     assert world.unwound == 0
-    world.characters[0].doing = FALLS
+    world.characters[0]._fall()
     world._unwind()
     assert world.unwound == 1
     assert np.allclose(state.qpos[0, 7 + joint], qpos[0, 7 + joint] + 2 * np.pi, atol=1e-5)
