@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from poise.body import mjcf
 from poise.errors import PoiseError
-from poise.formats import limited
+from poise.formats import c3d, fbx, limited, usd
 from poise.formats.limited import read_limited
 
 
@@ -93,3 +94,9 @@ def test_modules_beside_the_users_files_are_not_imported(
     monkeypatch.chdir(tmp_path)
     body = "try:\n    import evil\nexcept ImportError:\n    return {'a': np.zeros(1)}"
     assert "a" in read_limited(job(tmp_path, body), tmp_path / "a.bin", 1, "BIN file")
+
+
+def test_every_script_that_reads_apart_is_there() -> None:
+    # Tests of these formats are skipped where their packages are missing, and so would miss it.
+    for module in (c3d, fbx, usd, limited, mjcf):
+        assert module._SCRIPT.is_file(), module.__name__
