@@ -10,7 +10,7 @@ import torch
 
 from poise.env import observations as obs
 from poise.env import rewards as reward
-from poise.env.frame import Frame, Pose
+from poise.env.frame import Frame, ObsTerm, Pose
 from poise.motion.rotations import (
     axis_angle_to_quat,
     euler_to_quat,
@@ -244,3 +244,14 @@ def test_terms_are_pure():
     after = [[getattr(p, f.name) for f in fields(Pose)] for p in poses if p]
     for a, b in zip(before, after, strict=True):
         assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_columns_of_an_observation_have_names() -> None:
+    term = ObsTerm("goal", obs.root_height, parts={"pos": 3, "linvel": 3, "rot": 6})
+    assert term.columns(10, 24) == {
+        "goal": slice(10, 34),
+        "goal.pos": slice(10, 16),
+        "goal.linvel": slice(16, 22),
+        "goal.rot": slice(22, 34),
+    }
+    assert ObsTerm("height", obs.root_height).columns(3, 1) == {"height": slice(3, 4)}

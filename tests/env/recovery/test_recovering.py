@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.env import ImitationEnv, Reference
 from poise.env.recovery.clips import QUICK, RecoveryClips
 from poise.env.recovery.planner import entry
-from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering
+from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering, RecoveryPhases
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from toy_library import PLAIN, lively, tiny
@@ -190,3 +190,25 @@ def test_a_clip_that_is_not_come_back_to_goes_on(made: Imitation) -> None:
     env.step(torch.zeros(1, env.num_actions))
     assert goal.doing.tolist() == [TRACKS] and goal.clips.frame.tolist() == [1]
     env.close()
+
+
+@pytest.mark.parametrize("hurries", [False, True])
+def test_the_phases_of_a_fall_by_hand(hurries: bool) -> None:
+    one, none = torch.tensor([True, False]), torch.zeros(2, dtype=torch.bool)
+    fast, slow, first = torch.tensor([2.0, 0.1]), torch.tensor([0.1, 0.1]), torch.tensor([0])
+    phases = RecoveryPhases(2, 30.0, "cpu", hurries)
+    change = phases.watch(one, fast, one, none)
+    assert change.lost.tolist() == [True, False] and not change.rests.any() and not change.back.any()
+    assert phases.doing.tolist() == [FALLS, TRACKS]
+    # It is waited for until it rests, or for 1.5 s; one in a hurry until it lies no more.
+    assert phases.watch(none, fast, none, none).rests.tolist() == [hurries, False]
+    assert phases.watch(none, slow, one, none).rests.tolist() == [True, False]
+    waited = [bool(phases.watch(none, fast, one, none).rests[0]) for _ in range(44)]
+    assert waited.index(True) == 42
+    phases.return_by(first)
+    change = phases.watch(one, slow, none, none)
+    # What loses its recovery motion and stands needs no rest.
+    assert change.lost[0] and change.rests[0] and phases.vain.tolist() == [1, 0]
+    phases.return_by(first)
+    assert phases.watch(none, slow, none, one).back.tolist() == [True, False]
+    assert phases.doing.tolist() == [TRACKS, TRACKS] and not phases.vain.any()
