@@ -48,8 +48,8 @@ demo: $(VENV)/.installed
 live: $(VENV)/.installed
 	$(BIN)/poise live --open
 
-# Two at once: fixtures of a file are made once.
-PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile
+# Two at once: fixtures of a file are made once, and files that take long come first (tests/conftest.py).
+PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 test: $(VENV)/.dev
 	$(PYTEST) -m 'not (process or browser or learned or training or data or docs or benchmarks)'
 

@@ -15,7 +15,9 @@ torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks tests; files with long ones come first, so that no process waits for one at the end."""
     here = Path(__file__).parent
+    long = set()
     for item in items:
         if item.path.is_relative_to(here):
             inside = item.nodeid[len(item.nodeid.split("::")[0]) :]
@@ -23,6 +25,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             for mark, beginnings in MARKS.items():
                 if name.startswith(beginnings):
                     item.add_marker(mark)
+                    long.add(item.path)
+    items.sort(key=lambda item: item.path not in long)
 
 
 def _find_data() -> Path | None:

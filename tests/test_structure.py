@@ -1,5 +1,5 @@
-"""The structure of the source: no import cycle, also not inside functions; what nothing in it uses has a
-reason to be there; worlds and clips are no persons; what users import is checked strictly."""
+"""The structure of the source: no import cycle, also not inside functions; what users import is checked
+strictly."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 import structure
 
 from poise import __file__ as package
@@ -19,55 +18,11 @@ SOURCE = ROOT / "src"
 #: Modules that are public wherever they are imported.
 ALWAYS = ("__init__.py", "errors.py", "settings.py", "version.py")
 
-#: Public names that nothing in `src` reaches, and why they stand there.
-EXPLAINED = {
-    "twins in tests and benchmarks": (
-        "control/pd.py:stable_pd_torque", "sim/backend.py:body_angular_velocity_w",
-        "sim/backend.py:body_linear_velocity_w", "sim/backend.py:body_com_velocity_w",
-        "metrics/tracking_errors.py:mpjpe_pa",
-    ),
-    "figures of the benchmarks": (
-        "jobs/track/noise.py:robustness",
-        "jobs/tracker.py:Tracker.with_damping",
-        "papers/compliant/figures.py:throws",
-    ),
-    "analytic inverse kinematics, which keyframes will need": (
-        "kinematics/ik.py:clip_ik",
-        "kinematics/ik.py:polish",
-    ),
-    "for users of the library": (
-        "jobs/imitate.py:imitate", "score/card.py:read_score", "env/faces.py:GymVectorEnv",
-        "env/faces.py:GymEnv", "env/faces.py:RslRlVecEnv",
-        "formats/smpl.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
-        "sim/guard.py:replay_dump", "sim/floor.py:HeightField", "sim/floor.py:Steps",
-        "sim/props.py:Lift",
-        "papers/compliant/opponents.py:Teams", "papers/compliant/scene_training.py:save_learned",
-    ),
-    "called by the libraries that they belong to": (
-        "env/faces.py:GymVectorEnv.close_extras", "formats/pickles.py:_Machine.find_class",
-    ),
-}  # fmt: skip
 
-
-@pytest.fixture(scope="module")
-def found() -> dict:
-    return structure.structure(structure.Path(package).parent)
-
-
-def test_no_module_imports_itself_over_others(found: dict) -> None:
-    assert found["cycles_at_the_top"] == [] and found["cycles"] == []
-
-
-def test_what_nothing_uses_is_explained(found: dict) -> None:
-    unused = {name for names in found["unused"].values() for name in names}
-    explained = [name for names in EXPLAINED.values() for name in names]
-    assert sorted(unused - set(explained)) == []
-    # What is used again needs no reason any more.
-    assert sorted(set(explained) - unused) == []
-
-
-def test_worlds_and_clips_are_no_persons(found: dict) -> None:
-    assert found["who_whose"] == 0, found["persons"]
+def test_no_module_imports_itself_over_others() -> None:
+    source = Path(package).parent
+    trees = {p: ast.parse(p.read_text("utf-8")) for p in sorted(source.rglob("*.py"))}
+    assert [structure.cycles(graph) for graph in structure.imports(source, trees)] == [[], []]
 
 
 def test_public_modules_are_checked_strictly() -> None:

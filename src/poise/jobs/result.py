@@ -177,11 +177,11 @@ class Result:
     @property
     def source(self) -> Clip:
         """What came in, as what is written compares with it."""
-        if self.came is not None:
+        if self.came is not ABSENT:
             return self.came
         if self.travel is not None:
             return self.travel.beside
-        return self.imitation.library.clips[0] if self.placed is None else self.placed.source
+        return self.imitation.library.clips[0] if self.placed is ABSENT else self.placed.source
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -221,12 +221,12 @@ class Result:
 
     def as_written(self, hold: bool) -> Delivery:
         """What is written, a clip in place as it came. hold: standing feet are held."""
-        if self.evaluation is None:
+        if self.evaluation is ABSENT:
             many = len(self.filled.clips) > 1
             clips = {f"filled-{k}" if many else "filled": c for k, c in enumerate(self.filled.clips)}
             return Delivery(clips, clips, ABSENT, ())
         home = self.at_home if self.ways else None
-        source = None if self.placed is None else self.placed.source
+        source = None if self.placed is ABSENT else self.placed.source
         done = finished(self.imitation, self.evaluation, hold, source, home, self.undirected)
         if self.travel is None:
             return done
@@ -278,7 +278,7 @@ class Result:
                 code="folder-needed",
             )
         out.mkdir(parents=True, exist_ok=True)
-        other = self.placed is not None and self.placed.moved is not None
+        other = self.placed is not ABSENT and self.placed.moved is not None
         paths: dict[str, Path] = {}
         for name, clip in done.home.items():
             if other:
@@ -287,7 +287,7 @@ class Result:
                 write_clip(own, paths[body])
             paths[name] = motion or out / f"{name}{home_suffix(clip)}"
             write_clip(clip, paths[name])
-        if self.evaluation is not None:
+        if self.evaluation is not ABSENT:
             paths["score"] = write_score(done.card, out / "score.json")
             paths["report"] = out / "report.html"
             write_report(self.report(done), paths["report"])
@@ -299,12 +299,12 @@ class Result:
     def report(self, done: Delivery | None = None) -> Report:
         """The page of the first motion. done: what is written, by default with feet held."""
         done = done or self.finished
-        curve = {} if self.run is None else learning_curve(self.run)
-        source = None if self.placed is None else self.placed.source
+        curve = {} if self.run is ABSENT else learning_curve(self.run)
+        source = None if self.placed is ABSENT else self.placed.source
         page = make_report(self.imitation, replace(self.evaluation, card=done.card), curve, source)
         clip = source or self.imitation.library.clips[0]
         said, lost = [*self.said], page.lost
-        if self.placed is not None:
+        if self.placed is not ABSENT:
             count, lost = len(self.evaluation.recordings), self.failed_s
             who = [f" (character {k + 1})" if count > 1 else "" for k, _ in self.failures]
             fails = zip(self.failures, who, strict=True)
@@ -343,7 +343,7 @@ class Result:
             return {"motion": path}
         with claimed(path):
             paths = self.write(path).paths
-            if self.run is not None:
+            if self.run is not ABSENT:
                 paths = {**paths, "run": path / RUN}
                 if paths["run"].resolve() != self.run.resolve():
                     shutil.copytree(self.run, paths["run"], dirs_exist_ok=True)
@@ -351,7 +351,7 @@ class Result:
 
     def __repr__(self) -> str:
         said = f"{type(self).__name__}({self.source.name!r}, {self.source.seconds:.1f} s"
-        if (card := self.card) is not None:
+        if (card := self.card) is not ABSENT:
             said += f", success {card.succ:.0%}, {card.mpjpe_mm:.0f} mm"
             said += f", help {card.help.force_mean_n:.1f} N"
         return said + ")"
@@ -359,7 +359,7 @@ class Result:
     def _repr_html_(self) -> str:
         """A picture and a table for notebooks, self-contained."""
         source, card = self.source, self.card
-        rows = () if card is None else rows_of(card)
+        rows = () if card is ABSENT else rows_of(card)
         keys = self.at or self.keyframes
         return result_html(source.name, self.clip, source, rows, self.notes, keys)
 
