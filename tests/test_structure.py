@@ -24,18 +24,16 @@ EXPLAINED = {
     "twins in tests and benchmarks": (
         "control/pd.py:stable_pd_torque", "sim/backend.py:body_angular_velocity_w",
         "sim/backend.py:body_linear_velocity_w", "sim/backend.py:body_com_velocity_w",
-        "metrics/plausibility.py:uhc_skate", "metrics/plausibility.py:uhc_penetration",
-        "metrics/plausibility.py:physdiff_penetrate", "metrics/plausibility.py:physdiff_float",
         "metrics/tracking.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
-        "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
+        "jobs/track/noise.py:robustness",
         "jobs/tracker.py:Tracker.with_damping",
         "papers/compliant/figures.py:throws",
     ),
     "analytic inverse kinematics, which keyframes will need": (
         "kinematics/ik.py:clip_ik",
-        "kinematics/ik.py:polish", "kinematics/limbs.py:two_bone",
+        "kinematics/ik.py:polish",
     ),
     "for users of the library": (
         "jobs/imitate.py:imitate", "score/card.py:read_score", "env/faces.py:GymVectorEnv",

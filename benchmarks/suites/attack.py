@@ -122,16 +122,17 @@ def miniature(folder: Path) -> None:
 
 def tiny_perpetual() -> None:
     """The recipe with networks that are trained in no time, in this process alone."""
+    from poise.cli import train_perpetual
     from poise.learn import CloneConfig, PPOConfig
-    from poise.recipes import perpetual
-    from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
+    from poise.papers.perpetual.ablations import StagedPerpetual
+    from poise.recipes.perpetual_settings import RecoveryPlan
 
     ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
     own: dict[str, Any] = {
         "ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None,
         "recovering": RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2))
     }  # fmt: skip
-    perpetual.Perpetual = lambda **given: Perpetual(**(own | given))  # type: ignore[assignment,misc]
+    train_perpetual.recipe = lambda additive: StagedPerpetual(**own)
 
 
 def command_of(recipe: str, here: Path, out: Path) -> list[str]:

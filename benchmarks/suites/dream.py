@@ -25,8 +25,8 @@ from benchmarks.common.runner import Part, Raws
 from benchmarks.common.starts import Nothing
 from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
-from poise.env.generator import EndlessGoal, Steering
-from poise.env.led import FALLS, TRACKS
+from poise.env.generator import GeneratorGoal, Steering
+from poise.env.recovery.recovering import FALLS, TRACKS, Recovering
 from poise.jobs.endless.dreaming import dream
 from poise.jobs.endless.dreamt import PIECE, Figures
 from poise.jobs.endless.model import GeneratorModel, load_generator
@@ -126,10 +126,9 @@ class Rollouts:
 class _Keeps:
     """Keeps every world's frames."""
 
-    def __init__(self, goal: EndlessGoal, out: Rollouts):
+    def __init__(self, goal: Recovering, out: Rollouts):
         self.goal, self.out = goal, out
         self._frames, self.over = out.done.shape[1], False
-        self._all = torch.arange(goal.num_envs)
 
     def see(self, env: ImitationEnv, step: int) -> bool:
         """One more frame."""
@@ -140,16 +139,16 @@ class _Keeps:
             # What is down gets up, or does not; frames are not kept any more.
             return bool((self.goal.doing == TRACKS).all())
         self.out.done[:, k] = env.backend.state.qpos
-        self.out.asked[:, k] = self.goal.coordinates(self._all, self.goal.at)[0]
+        self.out.asked[:, k] = self.goal.start(None)[0]
         self.out.count += 1
         # Without recovery there is no more to see once all have fallen.
         self.over = self.goal.get_up is None and bool((self.goal.doing == FALLS).all())
         return self.over
 
 
-def told(out: Rollouts, goal: EndlessGoal) -> None:
+def told(out: Rollouts, goal: Recovering) -> None:
     """Takes the times from a goal; what happens after the end counts only if it is getting up."""
-    for name, found in (("lost", goal.falls), ("back", goal.back), ("reached", goal.reached)):
+    for name, found in (("lost", goal.lost), ("back", goal.back), ("reached", goal.reached)):
         last = out.count if name != "back" else math.inf
         setattr(out, name, [(i, round(s / goal.rate_hz, 2)) for i, s in found if s <= last])
 
@@ -170,13 +169,13 @@ def rollouts(
     task = replace(task, task=replace(task.task, help_by="all"))
     rate, steps = tracker.config.sim.control_hz, round(seconds * tracker.config.sim.control_hz)
     begins = [made.begin(1, torch.Generator().manual_seed(k)) for k in range(count)]
-    goal = EndlessGoal(
-        made.wishing(0.0 if targets else label_seconds, count), tracker.humanoid, rate,
-        tracker.recovery_clips if recover else None, count, seed=0,
-        lead=max(*tracker.config.window, 1) + 1, pasts=torch.cat(begins),
-        steering=Steering(targets), simulated=past == "simulated"
+    wishing = made.wishing(0.0 if targets else label_seconds, count)
+    motion = GeneratorGoal(
+        wishing, tracker.humanoid, rate, count, lead=max(*tracker.config.window, 1) + 1,
+        pasts=torch.cat(begins), steering=Steering(targets), simulated=past == "simulated",
     )  # fmt: skip
-    goal.draw(torch.arange(count))
+    goal = Recovering(motion, tracker.recovery_clips if recover else None)
+    goal.reset(torch.arange(count))
     width = tracker.humanoid.model.nq
     empty = np.zeros((2, count, steps, width), np.float32)
     out = Rollouts(empty[0], empty[1], 0, [], [], [])

@@ -36,7 +36,7 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics.retarget.keypoint_goal import PointBody
 from poise.live.characters import FALLS, RETURNS
-from poise.live.commands import LiveConfig
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live
 from poise.live.sources import Loop
 from poise.live.stream import Packet

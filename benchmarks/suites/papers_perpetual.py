@@ -28,8 +28,8 @@ from poise.jobs.perpetual.run import RESULT, begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import AmpConfig, CloneConfig, PPOConfig, Until
 from poise.motion import ClipLibrary
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes.perpetual import build
-from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.residual_force import ResidualForce
 from poise.recipes.shapes import BodyShapes
 
@@ -86,9 +86,11 @@ INGREDIENTS = {
 }
 
 
-def settings(name: str, seed: int) -> Perpetual:
+def settings(name: str, seed: int) -> StagedPerpetual:
     """One run's."""
-    additive = Perpetual.additive(help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed)
+    additive = StagedPerpetual.additive(
+        help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed
+    )
     # A small library has fewer hard moments, and the budget is small.
     additive = replace(additive, num_envs=512)
     ppo = replace(additive.ppo, minibatch=2048)
@@ -165,7 +167,7 @@ def ablated(places: Places, unit: str) -> Any:
     return measured(run.task, run.policy)
 
 
-def tiny(places: Places, config: Perpetual) -> Perpetual:
+def tiny(places: Places, config: StagedPerpetual) -> StagedPerpetual:
     """The same with networks of no size, for a smoke test."""
     if not places.smoke:
         return config

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.generator import EndlessGoal, Steering
-from poise.env.led import FALLS, RETURNS, TRACKS
+from poise.env.generator import GeneratorGoal, Steering
+from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
@@ -48,7 +48,7 @@ def task(tracker: Tracker) -> Imitation:
     return replace(made, task=replace(made.task, help_by="all"))
 
 
-def begun(task: Imitation, goal: EndlessGoal) -> tuple[ImitationEnv, Tensor]:
+def begun(task: Imitation, goal: Recovering) -> tuple[ImitationEnv, Tensor]:
     """An environment with its characters on the goal."""
     env = task.env(goal.num_envs, auto_reset=False, threads=1, help_scale=0.0)
     goal.draw(torch.arange(goal.num_envs))
@@ -60,13 +60,14 @@ def begun(task: Imitation, goal: EndlessGoal) -> tuple[ImitationEnv, Tensor]:
 def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, task: Imitation) -> None:
     assert tracker.recovery_clips is not None
     ease = tracker.recovery_clips.ease.double()
-    goal = EndlessGoal(Stands(ease), task.humanoid, 30.0, tracker.recovery_clips, 2, lead=12)
+    motion = GeneratorGoal(Stands(ease), task.humanoid, 30.0, 2, lead=12)
+    goal = Recovering(motion, tracker.recovery_clips)
     env, obs = begun(task, goal)
     for _ in range(20):
         obs = env.step(tracker.policy.act(obs)).final_obs
-    assert goal.doing.tolist() == [TRACKS, TRACKS] and not goal.falls
+    assert goal.doing.tolist() == [TRACKS, TRACKS] and not goal.lost
     # As many frames are known as a controller looks ahead.
-    assert bool((goal.count - goal.at > goal.lead).all())
+    assert bool((motion.count - motion.at > motion.lead).all())
     # The second one lies on its back a metre away.
     lying = env.backend.state.qpos.clone()
     up = tracker.recovery_clips.ups[0][0]
@@ -75,11 +76,11 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     still = torch.zeros_like(env.backend.state.qvel)
     env.backend.write(None, lying, still)
     obs = env.observe()
-    assert goal.doing.tolist() == [TRACKS, FALLS] and [w for w, _ in goal.falls] == [1]
+    assert goal.doing.tolist() == [TRACKS, FALLS] and [w for w, _ in goal.lost] == [1]
     # Its motion waits for it.
-    at = int(goal.at[1])
+    at = int(motion.at[1])
     goal.advance(None, None)
-    assert int(goal.at[1]) == at
+    assert int(motion.at[1]) == at
     shot, done = None, set[int]()
     for _ in range(400):
         obs = env.step(tracker.policy.act(obs)).final_obs
@@ -97,7 +98,7 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     risen = state[1, :2].clone()
     for _ in range(60):
         obs = env.step(tracker.policy.act(obs)).final_obs
-    assert len(goal.back) == 1 and len(goal.falls) == 1
+    assert len(goal.back) == 1 and len(goal.lost) == 1
     aims = goal.start(None)[0][1, :2]
     assert float((aims - env.backend.state.qpos[1, :2]).norm()) < 0.3
     assert float((aims - risen).norm()) < 0.05
@@ -106,7 +107,8 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     assert shot is not None
     env.restore(shot[0])
     torch.testing.assert_close(goal.ahead(), shot[1])
-    again = EndlessGoal(Stands(ease), task.humanoid, 30.0, tracker.recovery_clips, 2, lead=12)
+    motion = GeneratorGoal(Stands(ease), task.humanoid, 30.0, 2, lead=12)
+    again = Recovering(motion, tracker.recovery_clips)
     again.load_state(goal.state())
     assert torch.equal(again.doing, goal.doing) and torch.equal(again.at, goal.at)
     env.close()
@@ -121,7 +123,8 @@ def test_the_generator_may_see_what_was_done(tracker: Tracker, task: Imitation) 
             seen.append(past.clone())
             return super().generate(past, ids, rng)
 
-    goal = EndlessGoal(Keeps(ease), task.humanoid, 30.0, None, lead=1, simulated=True)
+    motion = GeneratorGoal(Keeps(ease), task.humanoid, 30.0, lead=1, simulated=True)
+    goal = Recovering(motion, None)
     goal.draw(torch.zeros(1, dtype=torch.long))
     goal.aim(None, None)
     pos, still = goal.layout.unpacked(goal.now()).pos, torch.zeros(1, len(task.humanoid.bodies), 3)
@@ -143,18 +146,20 @@ def test_without_recovery_clips_a_character_stays_where_it_fell(
     tracker: Tracker, task: Imitation
 ) -> None:
     assert tracker.recovery_clips is not None
-    goal = EndlessGoal(Stands(tracker.recovery_clips.ease.double()), task.humanoid, 30.0, None)
+    motion = GeneratorGoal(Stands(tracker.recovery_clips.ease.double()), task.humanoid, 30.0)
+    goal = Recovering(motion, None)
     env, _ = begun(task, goal)
     for _ in range(3):
         assert goal.watch(env.backend.state.qpos, env.pose().pos + 9.0, env.pose().linvel)
-    assert int(goal.doing) == FALLS and len(goal.falls) == 1 and not goal.back
+    assert int(goal.doing) == FALLS and len(goal.lost) == 1 and not goal.back
     env.close()
 
 
 def test_a_get_up_that_is_lost_is_tried_in_another_way(tracker: Tracker, task: Imitation) -> None:
     clips = tracker.recovery_clips
     assert clips is not None
-    goal = EndlessGoal(Stands(clips.ease.double()), task.humanoid, 30.0, clips, lead=1)
+    motion = GeneratorGoal(Stands(clips.ease.double()), task.humanoid, 30.0, lead=1)
+    goal = Recovering(motion, clips)
     goal.draw(torch.zeros(1, dtype=torch.long))
     goal.aim(None, None)
     lies, still = clips.ups[0][:1].clone(), torch.zeros(1, len(task.humanoid.bodies), 3)
@@ -164,7 +169,7 @@ def test_a_get_up_that_is_lost_is_tried_in_another_way(tracker: Tracker, task: I
         assert goal.doing.tolist() == [FALLS] and goal.rows()["vain"].tolist() == [tries]
         goal.watch(lies, goal.layout.unpacked(goal.now()).pos + 2.0, still)
         assert goal.doing.tolist() == [RETURNS]
-        took.append(int(goal._until))
+        took.append(int(goal._length))
     assert took[1] > took[0]
     # Once it is back, the next fall begins anew.
     while goal.doing.tolist() == [RETURNS]:
@@ -199,14 +204,15 @@ def test_of_several_futures_the_nearest_is_done_and_thought_over_halfway(
     ease[:2] = 0.0
     made, still = Circles(ease), torch.zeros(1, len(task.humanoid.bodies), 3)
     points = ((1.5, 0.0), (1.5, 1.5))
-    goal = EndlessGoal(made, task.humanoid, 30.0, None, lead=1, steering=Steering(points))
+    motion = GeneratorGoal(made, task.humanoid, 30.0, lead=1, steering=Steering(points))
+    goal = Recovering(motion, None)
     goal.draw(torch.zeros(1, dtype=torch.long))
     goal.aim(None, None)
-    assert int(goal.count) == made.past + made.future // 2
+    assert int(motion.count) == made.past + made.future // 2
     for _ in range(75):
         goal.advance(None, None)
         qpos = goal.start(None)[0]
         goal.watch(qpos, goal.layout.unpacked(goal.now()).pos, still)
     # The character is where it is to be: the straight ways take 20 and 30 frames and a bit.
     assert [world for world, _ in goal.reached] == [0, 0] and goal.reached[-1][1] < 70
-    assert made.asked > 12 and not goal.falls
+    assert made.asked > 12 and not goal.lost

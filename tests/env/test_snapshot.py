@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
-from poise.env.led import LedGoal
+from poise.env.recovery.recovering import Recovering
 from poise.env.yielding import DisplacedGoal
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
@@ -140,10 +140,10 @@ def test_what_leads_back_and_what_displaces_are_copied_too() -> None:
     assert made.recovery_clips is not None
     env = made.bare().env(3, auto_reset=False, threads=1, help_scale=0.0, guard=False)
     env.reset_to(torch.zeros(3, dtype=torch.long), torch.zeros(3, dtype=torch.long))
-    for wrap in (lambda g: LedGoal(g, made.recovery_clips), DisplacedGoal):
+    for wrap in (lambda g: Recovering(g, made.recovery_clips), DisplacedGoal):
         goal = wrap(env.goal.clips)
         env.set_goal(goal)
-        if isinstance(goal, LedGoal):
+        if isinstance(goal, Recovering):
             goal.lead(torch.tensor([1]), env.backend.state.qpos)
         else:
             goal.offset[2, 1] = 0.3

@@ -11,16 +11,17 @@ import torch
 from poise.env.recovery.clips import CALM, QUICK
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
-from poise.jobs.perpetual.run import begin, going_on, resume, train
-from poise.jobs.perpetual.stage_order import Progress, Stage
-from poise.jobs.perpetual.stage_start import Owners, demonstrations, odds, practised, staged
+from poise.jobs.perpetual.run import begin, resume, train
+from poise.jobs.perpetual.stages import Progress, Stage, demonstrations, odds, practised, staged
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
 from poise.learn.composer import Composer
+from poise.papers.perpetual.ablations import StagedPerpetual, going_on
+from poise.papers.perpetual.primitive_stages import Owners
 from poise.recipes.perpetual import build, standing
-from poise.recipes.perpetual_settings import WIDE, Perpetual
+from poise.recipes.perpetual_settings import WIDE
 from poise.recipes.shapes import BodyShapes
 from refusals import refused
 from toy_human import swing
@@ -124,9 +125,9 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
 
 
 def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
-    assert going_on(tracker.config, Perpetual(recovery=False)).single
+    assert going_on(tracker.config, StagedPerpetual(recovery=False)).single
     fast = replace(tracker.config, ppo=replace(tracker.config.ppo, policy_lr=3e-4))
-    assert going_on(fast, Perpetual(recovery=False)).ppo.policy_lr == 1e-4
+    assert going_on(fast, StagedPerpetual(recovery=False)).ppo.policy_lr == 1e-4
     config = going_on(tracker.config, replace(tiny(recovery=True), single=True))
     assert config.single and config.recovery and config.recovering.demonstrations == 4
     run, told = tmp_path / "run", []

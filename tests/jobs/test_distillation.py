@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from poise.jobs.open import open_run
+from poise.jobs.perpetual.distillation import PolicyTeacher, distilled, taught_by
 from poise.jobs.perpetual.run import begin, train
-from poise.jobs.perpetual.stage_start import PolicyTeacher, distilled, taught_by
 from poise.jobs.tracker import Tracker
 from poise.learn import Until
 from poise.recipes.perpetual import build

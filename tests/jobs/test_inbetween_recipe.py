@@ -121,6 +121,7 @@ def test_a_run_of_before_a_setting_existed_goes_on(run: Path, library: Path, tmp
 def test_poise_inbetween_meets_its_keyframes(run: Path, library: Path, tmp_path: Path) -> None:
     source, out = library / "walk_plain_3.bvh", tmp_path / "out.bvh"
     argv = ["inbetween", str(source), "--keyframes", "5,35,50", "-o", str(out), "--model", str(run)]
+    argv += ["--adapt", "2"]
     assert main(argv) == 0
     a, b = read_clip(source), read_clip(out)
     assert b.frames == a.frames
@@ -158,10 +159,8 @@ def test_half_precision_models_are_used_alike(run: Path, library: Path, tmp_path
     for folder in (run, tmp_path):
         out = tmp_path / f"out-{len(outs)}.bvh"
         source = str(library / "walk_plain_3.bvh")
-        assert (
-            main(["inbetween", source, "--keyframes", "5,35", "-o", str(out), "--model", str(folder)])
-            == 0
-        )
+        argv = ["inbetween", source, "--keyframes", "5,35", "-o", str(out), "--model", str(folder)]
+        assert main([*argv, "--adapt", "0"]) == 0
         outs.append(read_clip(out).positions())
     assert np.abs(outs[0] - outs[1]).max() < 0.01
 

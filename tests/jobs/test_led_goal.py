@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
-from poise.env.led import FALLS, RETURNS, TRACKS, LedGoal
 from poise.env.recovery.clips import QUICK, RecoveryClips
 from poise.env.recovery.planner import entry
+from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from toy_library import PLAIN, lively, tiny
@@ -36,14 +36,14 @@ def made() -> Imitation:
 class Puppets:
     """Physics that put every character that does not fall where its goal is: a perfect tracker."""
 
-    def __init__(self, env: ImitationEnv, goal: LedGoal):
+    def __init__(self, env: ImitationEnv, goal: Recovering):
         self.env, self.goal = env, goal
         self.aside: torch.Tensor | None = None
         env.backend.step = self.step  # type: ignore[method-assign]
 
     def step(self, nstep: int = 1) -> None:
         s, falls = self.env.backend.state, (self.goal.doing == FALLS).unsqueeze(-1)
-        qpos = torch.where(falls, s.qpos.double(), self.goal._coordinates(1))
+        qpos = torch.where(falls, s.qpos.double(), self.goal.start(None, 1)[0])
         if self.aside is not None:
             qpos[:, :2] += self.aside
             self.aside = None
@@ -55,12 +55,12 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
     clip = torch.tensor([own.names.index("walk")] * 2)
     env.reset_to(clip, torch.zeros_like(clip))
     assert made.recovery_clips is not None
-    goal = LedGoal(env.goal.clips, made.recovery_clips)
+    goal = Recovering(env.goal.clips, made.recovery_clips)
     env.set_goal(goal)
     world, seen, frames = Puppets(env, goal), [], []
     for step in range(400):
         seen.append(goal.doing.tolist())
-        frames.append(goal.frame.tolist())
+        frames.append(goal.clips.frame.tolist())
         if step > 4 and seen[-1][0] == TRACKS and frames[-1][0] > frames[5][0] + 5:
             break
         world.aside = torch.tensor([[-1.0, 2.0], [0.0, 0.0]]) if step == 4 else None
@@ -74,7 +74,7 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
     waited = [f for (f, _), (k, _) in zip(frames, seen, strict=True) if k == RETURNS]
     assert len(set(waited)) == 1 and waited[0] >= 5
     assert frames[-1][0] > waited[0] and torch.equal(env.clip, clip)
-    assert torch.equal(env.goal_pose().pos, own.gather(clip, goal.frame).pos)
+    assert torch.equal(env.goal_pose().pos, own.gather(clip, goal.clips.frame).pos)
     env.close()
 
 
@@ -83,7 +83,7 @@ def test_a_motion_is_entered_where_the_way_is_short(made: Imitation) -> None:
     env, own = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False), made.reference
     clip = own.names.index("walk")
     assert made.recovery_clips is not None
-    goal = LedGoal(env.goal.clips, made.recovery_clips)
+    goal = Recovering(env.goal.clips, made.recovery_clips)
     start, end = (own.coordinates(torch.tensor([clip]), torch.tensor([k]))[0][0] for k in (0, 10_000))
     way = end[:2] - start[:2]
     entered = []
@@ -106,7 +106,7 @@ def begun(made: Imitation) -> tuple[ImitationEnv, Tensor, RecoveryClips]:
 
 def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imitation) -> None:
     env, zero, recovery_clips = begun(made)
-    goal = LedGoal(env.goal.clips, recovery_clips)
+    goal = Recovering(env.goal.clips, recovery_clips)
     qpos = env.backend.state.qpos.clone()
     qpos[:, 0] += 3.0
     env.backend.write(None, qpos, env.backend.state.qvel.clone())
@@ -139,12 +139,12 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
     motions = [moved[spans[0]].numpy(), moved[spans[1]].numpy(), still.numpy()]
     chain = replace(made, reference=Reference(own.humanoid, motions, own.rate_hz, ["a", "b", "c"]))
     env, zero, recovery_clips = begun(chain)
-    goal = LedGoal(env.goal.clips, recovery_clips, chained=True)
+    goal = Recovering(env.goal.clips, recovery_clips, chained=True)
     env.set_goal(goal)
     Puppets(env, goal)
     seen, ends = [], [len(m) - 1 for m in motions]
     for _ in range(600):
-        seen.append((int(goal.doing), int(env.clip), int(goal.frame)))
+        seen.append((int(goal.doing), int(env.clip), int(goal.clips.frame)))
         if seen[-1] == (TRACKS, 2, ends[2]):
             break
         env.step(torch.zeros(1, env.num_actions))
@@ -156,7 +156,7 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
     # A copy that plans nothing stays at the end of its clip.
     env.set_goal(env.goal.clips)
     env.reset_to(zero, zero + ends[0] - 1)
-    goal = LedGoal(env.goal.clips, recovery_clips, chained=True, plans=False)
+    goal = Recovering(env.goal.clips, recovery_clips, chained=True, plans=False)
     env.set_goal(goal)
     Puppets(env, goal)
     for _ in range(3):
@@ -167,7 +167,7 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
 
 def test_who_has_lost_nothing_walks_to_the_next_clip_without_hurry(made: Imitation) -> None:
     env, zero, recovery_clips = begun(made)
-    goal = LedGoal(env.goal.clips, replace(recovery_clips, pace=QUICK), chained=True)
+    goal = Recovering(env.goal.clips, replace(recovery_clips, pace=QUICK), chained=True)
     qpos, ways = env.backend.state.qpos.clone().double(), {}
     qpos[:, 0] += 4.0
     # Who is led without a word hurries, whatever it did: so recovery is tried out.
@@ -183,10 +183,10 @@ def test_who_has_lost_nothing_walks_to_the_next_clip_without_hurry(made: Imitati
 
 def test_a_clip_that_is_not_come_back_to_goes_on(made: Imitation) -> None:
     env, _, recovery_clips = begun(made)
-    goal = LedGoal(env.goal.clips, recovery_clips, chained=True, returns=False)
+    goal = Recovering(env.goal.clips, recovery_clips, chained=True, returns=False)
     env.set_goal(goal)
     world = Puppets(env, goal)
     world.aside = torch.tensor([[2.0, 0.0]])
     env.step(torch.zeros(1, env.num_actions))
-    assert goal.doing.tolist() == [TRACKS] and goal.frame.tolist() == [1]
+    assert goal.doing.tolist() == [TRACKS] and goal.clips.frame.tolist() == [1]
     env.close()

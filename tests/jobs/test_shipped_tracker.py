@@ -14,9 +14,9 @@ from poise.formats import read_clip
 from poise.jobs.library.files import subject_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
+from poise.jobs.result import shortfalls
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.tracked import shortfalls
 from poise.jobs.tracker import POLICIES, SHIPPED, Tracker
 from poise.score.recovered import KINDS
 from toy_human import human, swing, turn

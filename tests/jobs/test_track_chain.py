@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv, Reference
-from poise.env.led import RETURNS, TRACKS, LedGoal
+from poise.env.recovery.recovering import RETURNS, TRACKS, Recovering
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import recovering, track, write
+from poise.jobs.track import recovering, track
 from poise.jobs.track.placement import home, place, place_all
-from poise.jobs.track.tracked import cut, parts_of
+from poise.jobs.track.recovering import cut, parts_of
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip, shifted, trim
 from poise.plan import LookaheadConfig
@@ -67,7 +67,7 @@ def test_two_walks_apart_are_one_motion(tracker: Tracker, tmp_path: Path) -> Non
     r = tracked.evaluation.rollouts
     own = (r.pos[0, begin : begin + 30] - r.ref_pos[0, begin : begin + 30]).norm(dim=-1).mean() * 1000
     assert card.per_clip[1]["mpjpe_global_mm"] == pytest.approx(float(own), rel=1e-4)
-    done = write(tracked, tmp_path / "out", tmp_path / "out.bvh")
+    done = tracked.write(tmp_path / "out", tmp_path / "out.bvh")
     assert set(done.paths) == {"simulated", "body", "score", "report"}
     made = read_clip(tmp_path / "out.bvh")
     assert made.frames == len(qpos) and made.skeleton.names == clips[0].skeleton.names
@@ -146,17 +146,18 @@ def test_a_clip_that_is_given_up_is_left_for_the_next(
 
 def test_clips_that_are_not_come_to_are_left_three_in_a_row_at_most() -> None:
     goal, left = SimpleNamespace(), list[int]()
-    goal.reference = SimpleNamespace(length=torch.tensor([2] * 9))
+    length = SimpleNamespace(length=torch.tensor([2] * 9))
     goal.rate_hz, goal.chained, goal.lost, goal.doing = 1.0, True, [], torch.tensor([TRACKS])
-    goal.clips, goal.frame = SimpleNamespace(clip=torch.tensor([0])), torch.tensor([0])
-    goal.aimed = lambda: torch.zeros(1, 7)
+    zero = torch.tensor([0])
+    goal.clips = SimpleNamespace(clip=zero, frame=zero, reference=length)
+    goal.aimed = torch.zeros(1, 7)
 
     def leave(_: object) -> None:
         left.append(int(goal.clips.clip))
-        goal.clips.clip, goal.frame = goal.clips.clip + 1, torch.tensor([0])
+        goal.clips.clip, goal.clips.frame = goal.clips.clip + 1, torch.tensor([0])
 
     goal.leave = leave
-    led = recovering._Led(cast("LedGoal", goal), torch.zeros(1, 7))
+    led = recovering._Led(cast("Recovering", goal), torch.zeros(1, 7))
     env = SimpleNamespace(given=torch.zeros(1, 1))
     away, step = math.ceil(recovering.AWAY_S) + 1, 0
 
@@ -225,10 +226,11 @@ def test_what_is_refused(tracker: Tracker, tmp_path: Path) -> None:
 def test_a_motion_is_given_up_where_it_is_lost_again_and_again(apart: int, ends: bool) -> None:
     """Nine losses within ten seconds of a motion end it; nine in a long one do not."""
     goal = SimpleNamespace(rate_hz=1.0, chained=False, lost=[], doing=torch.tensor([TRACKS]))
-    goal.reference = SimpleNamespace(length=torch.tensor([1000]))
-    goal.clips, goal.frame = SimpleNamespace(clip=torch.tensor([0])), torch.tensor([0])
-    goal.aimed = lambda: torch.zeros(1, 7)
-    led = recovering._Led(cast("LedGoal", goal), torch.zeros(1, 7))
+    length = SimpleNamespace(length=torch.tensor([1000]))
+    zero = torch.tensor([0])
+    goal.clips = SimpleNamespace(clip=zero, frame=zero, reference=length)
+    goal.aimed = torch.zeros(1, 7)
+    led = recovering._Led(cast("Recovering", goal), torch.zeros(1, 7))
     env, step = cast("ImitationEnv", SimpleNamespace(given=torch.zeros(1, 1))), 0
     over = led.see(env, step)
     for k in range(30):
@@ -237,5 +239,5 @@ def test_a_motion_is_given_up_where_it_is_lost_again_and_again(apart: int, ends:
                 goal.lost.append((0, apart * k // 3))
             goal.doing, step = torch.tensor([doing]), step + 1
             over = over or led.see(env, step)
-        goal.frame = torch.tensor([apart * (k + 1) // 3])
+        goal.clips.frame = torch.tensor([apart * (k + 1) // 3])
     assert over == ends

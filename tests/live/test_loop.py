@@ -11,7 +11,7 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
-from poise.live.commands import LiveConfig
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live, generator_for
 from poise.live.sources import Loop, packet_of
 from poise.live.stream import Packet
@@ -300,7 +300,7 @@ def test_whole_turns_of_a_fallen_character_are_left_out(tracker: Tracker, walk: 
     before = state.xpos.clone()
     world._unwind()
     assert world.unwound == 0
-    world.characters[0].doing = FALLS
+    world.characters[0]._fall()
     world._unwind()
     assert world.unwound == 1
     assert np.allclose(state.qpos[0, 7 + joint], qpos[0, 7 + joint] + 2 * np.pi, atol=1e-5)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from poise.env.generator import EndlessGoal
+from poise.env.generator import GeneratorGoal
 from poise.jobs.endless.model import load_generator
 from poise.jobs.open import open_run
 from poise.synthesis.generator import FEWEST, Codes, Wishes
@@ -64,8 +64,8 @@ def test_wishes_are_in_snapshots_and_the_same_by_seed() -> None:
     made = model.generator(tracker.humanoid)
     assert made.wishing(0.0).wishes is None and made.wishing(0.0).rows() == {}
 
-    def goal() -> EndlessGoal:
-        one = EndlessGoal(made.wishing(10.0, 2), tracker.humanoid, 30.0, None, 2, seed=3, lead=40)
+    def goal() -> GeneratorGoal:
+        one = GeneratorGoal(made.wishing(10.0, 2), tracker.humanoid, 30.0, 2, seed=3, lead=40)
         one.draw(torch.arange(2))
         one.aim(None, None)
         return one

@@ -33,11 +33,97 @@ T = TypeVar("T")
 
 #: A switch; its help states no default, which the sentence tells.
 Flag = Annotated[bool, arg(help_behavior_hint="")]
+
+
+def _option(help: str, **how: Any) -> Any:
+    return arg(help=help, **{"help_behavior_hint": "", **how})
+
+
+#: Options that several verbs have, with what their help says.
+Json = Annotated[bool, _option("Print one JSON document and nothing else on stdout, see docs/cli.md.")]
+Force = Annotated[bool, _option("Write over files that are there.")]
+OpenPage = Annotated[bool, _option("Open the page in the browser.")]
+Out = Annotated[
+    Path,
+    arg(
+        aliases=["-o"],
+        metavar="DIR|FILE",
+        help="The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the "
+        "rest goes into a folder of its name.",
+    ),
+]
+HoldFeet = Annotated[
+    bool,
+    _option(
+        "Leave feet as simulated; by default standing feet are held to the spot in the written motion."
+    ),
+]
+PolicyFile = Annotated[
+    Path | None,
+    _option(
+        "A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that "
+        "comes along and is told places alone; by default the one for rotations that comes with Poise.",
+        metavar="FILE|RUN",
+    ),
+]
+Threads = Annotated[int, arg(metavar="N", help="Cores; 0 is all.")]
+Budget = Annotated[
+    float | None,
+    _option(
+        "Simulated control steps of lookahead for each that is made, by default 192, or 768 for "
+        "keyframes. More are nearer and cleaner, and take longer.",
+        metavar="STEPS",
+    ),
+]
+Weights = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(
+        metavar="PART=FACTOR[:A-B]",
+        help="Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in "
+        "frames.",
+    ),
+]
+Pins = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(
+        metavar="LIMB:A-B",
+        help="Hands or feet that stay where they are in frames A to B, such as left_foot:12-40.",
+    ),
+]
+Touches = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(
+        metavar="LIMB:FRAME:X,Y,Z",
+        help="Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1.",
+    ),
+]
+Span = Annotated[
+    str | None,
+    _option(
+        "Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it.",
+        name="range",
+        metavar="A-B",
+    ),
+]
+Earlier = Annotated[
+    Path | None,
+    _option(
+        "The folder of an earlier result of the same motion, for --range.",
+        name="from",
+        metavar="RESULT",
+    ),
+]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
 #: `formats.guess.UPS`; stated here since motion is imported only when a verb reads.
 Up = Literal["Y", "Z", "X", "-Y", "-Z", "-X"]
-#: What becomes of a clip in place.
-InPlace = Literal["auto", "keep", "travel"]
+InPlaceMode = Annotated[
+    Literal["auto", "keep", "travel"],
+    arg(
+        help="A clip that walks in place is simulated with the travel that its feet tell. auto writes "
+        "it in place again, a loop as a loop; travel writes it with its travel; keep simulates it as it "
+        "is."
+    ),
+]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 
@@ -55,8 +141,8 @@ class Reading:
     """Frames per second."""
     unit: Annotated[str | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Metres in one unit of the file, 0.01 for example; or m, dm, cm, mm, in, ft."""
-    up: Annotated[Up | None, arg(metavar="Y|Z|-Y|-Z", help_behavior_hint="")] = None
-    """The file's vertical: Y, Z or X, with - where it points down."""
+    up: Annotated[Up | None, arg(metavar="Y|Z|X|-Y|-Z|-X", help_behavior_hint="")] = None
+    """The axis of the file that points up: Y, Z or X, with - where it points down."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
     """Which animation of a file that holds several (glTF, USD; by default the longest), or which of its
     people (TRC, C3D, CSV, arrays; by default the first)."""

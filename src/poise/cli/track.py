@@ -4,21 +4,41 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.console import INTERRUPTED, LOST, Answer, print_card, say, tell
-from poise.cli.options import Flag, InPlace, Reading, check_range, each, places
+from poise.cli.options import (
+    Budget,
+    Earlier,
+    Flag,
+    Force,
+    HoldFeet,
+    InPlaceMode,
+    Json,
+    Out,
+    Pins,
+    PolicyFile,
+    Reading,
+    Span,
+    Threads,
+    Touches,
+    Weights,
+    check_range,
+    each,
+    places,
+)
 from poise.cli.training import clock, showing, staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.stage_order import Progress
-    from poise.jobs.track import TrackConfig, Tracked
+    from poise.jobs.perpetual.stages import Progress
+    from poise.jobs.result import Result
+    from poise.jobs.track import TrackConfig
     from poise.jobs.tracker import Tracker
     from poise.kinematics.supports import Support
     from poise.motion import Clip
@@ -32,16 +52,12 @@ class Options:
     what is lost then it can --learn. Several motions are done one after another in one episode, each
     where it stands: between them the character walks, turns and gets up to the next one's start."""
 
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
-    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
-    into a folder of its name."""
+    out: Out
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="FILE ...", help_behavior_hint="(required)")
     ] = ()
     """Motion files: clips of any human skeleton, or keypoints; or one folder, each file on its own."""
-    policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
-    along and is told places alone; by default the one for rotations that comes with Poise."""
+    policy: PolicyFile = None
     controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
     """policy acts alone, at once; lookahead tries in copies of the character before it acts, which is
     nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto
@@ -49,9 +65,7 @@ class Options:
     body: Literal["policy", "own"] = "policy"
     """policy is the body that it was trained on, onto which the motion is retargeted; own has the same
     joints with the lengths and masses of the skeleton that came in."""
-    budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
-    """Simulated control steps for each that is made, of lookahead; by default 192. More are nearer and
-    cleaner, and take longer."""
+    budget: Budget = None
     characters: Annotated[int, arg(metavar="N")] = 512
     """Characters that search at once; more find harder motions."""
     rounds: Annotated[int, arg(metavar="N")] = 1
@@ -59,8 +73,7 @@ class Options:
     learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
     """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
-    threads: Annotated[int, arg(metavar="N")] = 0
-    """Cores for lookahead, search and --learn; 0 is all."""
+    threads: Threads = 0
     reset_on_fail: Flag = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
     recover: Flag = False
@@ -72,32 +85,22 @@ class Options:
     on something, and a sentence says so."""
     support: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Boxes beside the motion that stand there instead (.json), such as a result's supports.json."""
-    weight: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PART=FACTOR[:A-B]")] = ()
-    """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
-    pin: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:A-B")] = ()
-    """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
-    touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
-    """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
-    span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
-    """Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
-    earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
-    """The folder of an earlier result of the same motion, for --range."""
+    weight: Weights = ()
+    pin: Pins = ()
+    touch: Touches = ()
+    span: Span = None
+    earlier: Earlier = None
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise, and of what lookahead, search and --learn draw."""
-    in_place: InPlace = "auto"
-    """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
-    place again, a loop as a loop; travel writes it with its travel; keep simulates it as it is."""
-    hold_feet: Flag = True
-    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
+    in_place: InPlaceMode = "auto"
+    hold_feet: HoldFeet = True
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the policy as one file (.safetensors), which starts faster than a run folder."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+    force: Force = False
+    json: Json = False
+    reading: OmitArgPrefixes[Reading] = Reading()
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
@@ -179,11 +182,11 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             "several characters make several files", motion, "Give a folder as -o", code="folder-needed"
         )
     from poise.jobs.open import open_run
-    from poise.jobs.track import TrackConfig, write
+    from poise.jobs.result import story
+    from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.tracked import story
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 
@@ -216,7 +219,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             if tracked is before:
                 tell("What was learned does it no better: the motion as it was before stays.")
         with working("writing"):
-            done = write(tracked, out, motion, o.hold_feet)
+            done = tracked.write(out, motion, o.hold_feet)
             if o.save_policy is not None:
                 save_tracker(tracker, o.save_policy)
     print_card(done.card)
@@ -270,7 +273,7 @@ def follow(
     config: TrackConfig,
     said: list[str],
     what: str = "tracking",
-) -> Tracked:
+) -> Result:
     """The motions as they are tracked, with a bar while it is looked ahead or searched. What speaks
     against a motion is told before it is simulated, and once: `said` is what was."""
     from poise.jobs.track import track
@@ -291,7 +294,7 @@ def telling(said: list[str]) -> Callable[[str], None]:
     return warn
 
 
-def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
+def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
     from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
@@ -318,7 +321,7 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
     return learned.tracker
 
 
-def advice(options: Options, tracked: Tracked) -> str:
+def advice(options: Options, tracked: Result) -> str:
     """What to do about a motion that was lost."""
     o = options
     if tracked.parts:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from poise.jobs.warm_start import TrainingCallbacks
     from poise.learn import CloneStats, IterationStats, PolicyBundle, Until, WarmStart
     from poise.motion import Clip, ClipLibrary
-    from poise.plan import TrajOptStats
+    from poise.papers.perpetual.trajopt import TrajOptStats
     from poise.recipes.imitation import Imitation
     from poise.score import ScoreCard
 

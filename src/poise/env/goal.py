@@ -67,8 +67,9 @@ class Goal(ABC):
         self.clips.seek(clip, frame)
 
     @abstractmethod
-    def start(self, ids: Tensor | None) -> Start:
-        """Coordinates in which episodes of worlds `ids`, all for None, begin on the goal."""
+    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+        """Coordinates of the goal in worlds `ids`, all for None, in which episodes begin; or those of so
+        many control steps later."""
 
     @abstractmethod
     def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
@@ -236,10 +237,9 @@ class ClipGoal(Goal):
         self.clip.copy_(clip)
         self.frame.copy_(frame)
 
-    def start(self, ids: Tensor | None) -> Start:
-        if ids is None:
-            return self.reference.coordinates(self.clip, self.frame)
-        return self.reference.coordinates(self.clip[ids], self.frame[ids])
+    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+        clip, frame = (self.clip, self.frame) if ids is None else (self.clip[ids], self.frame[ids])
+        return self.reference.coordinates(clip, frame + later)
 
     def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
         ahead = self.frame + 1 if held is None else self.frame + 1 - held.long()

@@ -103,6 +103,14 @@ class BufferedGoal(Goal):
         self.low[ids] = torch.minimum(self.low[ids], qpos[..., 2].amin(1))
         self.count[ids] += frames
 
+    def posed(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
+        """Another motion `(f, 7 + n)`, and its packed poses `(f, W)` as this goal has its own."""
+        qvel = torch.zeros(len(qpos), self.qvel.shape[-1]).to(qpos)
+        qvel[1:] = difference(qpos[1:], qpos[:-1]) * self.rate_hz
+        packs = self._pack(qpos, qvel)
+        self.layout.place(packs).low.fill_(float(qpos[:, 2].min()))
+        return qpos, packs
+
     def coordinates(self, ids: Tensor, index: Tensor) -> Start:
         """qpos `(n, 7 + n)` and qvel `(n, 6 + n)` of frames `index (n,)` of worlds `ids (n,)`."""
         known = self.count[ids]
@@ -140,9 +148,9 @@ class BufferedGoal(Goal):
     def supply(self, ids: Tensor) -> None:
         """Frames for worlds `ids (n,)` that are about to be read, as far as there are any."""
 
-    def start(self, ids: Tensor | None) -> Start:
+    def start(self, ids: Tensor | None, later: int = 0) -> Start:
         ids = self._every if ids is None else ids
-        return self.coordinates(ids, self.at[ids])
+        return self.coordinates(ids, self.at[ids] + later)
 
     def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
         ids = self._every if ids is None else ids

@@ -68,8 +68,8 @@ class DisplacedGoal(Goal):
         self.offset.zero_()
         self.rate.zero_()
 
-    def start(self, ids: Tensor | None) -> Start:
-        qpos, qvel = self.goal.start(ids)
+    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+        qpos, qvel = self.goal.start(ids, later)
         rows = self._every if ids is None else ids
         return displaced(qpos, self.offset[rows]), qvel + self.rate[rows]
 

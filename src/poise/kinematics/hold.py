@@ -29,7 +29,7 @@ from poise.motion.smoothing import find_runs, gaussian, smooth_lift
 #: A (s) and B (1/s) of the module's text.
 SMOOTH_S, RETURN_PER_S = 0.006, 0.6
 #: See `limbs.soft_reach`: feet that stand are kept in place by legs that may be nearly straight.
-_SOFT = 0.003
+SOFT = 0.003
 #: Weight of a frame that must stay as it is; what is left of its correction is set to zero.
 _PINNED = 1e8
 
@@ -113,7 +113,7 @@ def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]
         touched |= one.shift.any(-1) | (one.turn != 0) | (one.tilt != 0)
         if one.roll is not None:
             touched |= one.roll != 0
-    out = match_positions(skeleton, rot, root, goals, soft=_SOFT)
+    out = match_positions(skeleton, rot, root, goals, soft=SOFT)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=rot.dtype)
     for joint, one in leads.items():
         # The foot keeps its turn in the world, so its own turn is that of the world seen from it.

@@ -37,53 +37,12 @@ BACKWARDS = 0.25
 _LIMBS = {"foot": ("thigh", "shin"), "hand": ("upper_arm", "forearm")}
 
 
-class TwoBone(NamedTuple):
-    """mid, end: `(..., 3)` m, world. normal: `(..., 3)`, the unit axis about which the limb bends."""
-
-    mid: Tensor
-    end: Tensor
-    normal: Tensor
-
-
 class Limb(NamedTuple):
     """The joints of one limb: where it starts (hip), bends (knee) and ends (ankle)."""
 
     root: int
     mid: int
     end: int
-
-
-def two_bone(
-    root: Tensor,
-    target: Tensor,
-    pole: Tensor,
-    l1: Tensor | float,
-    l2: Tensor | float,
-    soft: float = SOFT,
-) -> TwoBone:
-    """A limb of bones `l1`, `l2` (m) from `root` towards `target`, bent to the side of `pole`.
-
-    Args:
-        root, target: `(..., 3)` m. pole: `(..., 3)`, a direction; only its part across the line from
-            root to target counts (an axis across it is taken where nothing remains).
-        soft: see `soft_reach`. A target out of reach is approached along the line to it.
-
-    The law of cosines gives the place of the knee along that line:
-    a = (l1^2 - l2^2 + d^2) / (2 d), h = sqrt(l1^2 - a^2).
-    """
-    l1, l2 = (torch.as_tensor(x, dtype=root.dtype) for x in (l1, l2))
-    line = target - root
-    along = _direction(line)
-    d = soft_reach(line.norm(dim=-1), l1, l2, soft)
-    side = pole - (pole * along).sum(-1, keepdim=True) * along
-    lost = side.norm(dim=-1, keepdim=True) < 1e-9 * (1.0 + pole.norm(dim=-1, keepdim=True))
-    side = normalize(torch.where(lost, across(along), side))
-    a = (l1.square() - l2.square() + d.square()) / (2.0 * d.clamp_min(1e-9))
-    a = torch.minimum(torch.maximum(a, -l1), l1)
-    h = (l1.square() - a.square()).clamp_min(0.0).sqrt()
-    mid = root + a.unsqueeze(-1) * along + h.unsqueeze(-1) * side
-    # The end turns from the side towards the line: upper bone x lower bone points along side x along.
-    return TwoBone(mid, root + d.unsqueeze(-1) * along, torch.linalg.cross(side, along))
 
 
 def soft_reach(distance: Tensor, l1: Tensor, l2: Tensor, soft: float = SOFT) -> Tensor:

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.learn.between import Between, BetweenConfig
 from poise.learn.checkpoint import (
     LATEST,
     ModelMeta,
@@ -35,10 +34,9 @@ from poise.learn.checkpoint import (
     under,
 )
 from poise.learn.rollout import TrainingError
-from poise.learn.rtn import RTN, RTNConfig
 from poise.learn.run import Log, interruptible
 from poise.learn.transition import FilledGap, Known, SkeletonLayout, TransitionNet, joint_positions
-from poise.settings import Checked, Count, NotNegative, Positive, Range, check_data, from_data
+from poise.settings import Checked, Count, NotNegative, Positive, Range, check_data, from_data, imported
 
 #: Times that saving takes, which pass until the next checkpoint at least.
 _SAVING = 20.0
@@ -269,7 +267,25 @@ def train_inbetween(
 
 #: The file in a model's folder.
 MODEL = "model.safetensors"
-KINDS = ("transformer", "rtn")
+#: The networks by name: the places of its class and of its sizes.
+NETWORKS = {
+    "transformer": ("poise.learn.between:Between", "poise.learn.between:BetweenConfig"),
+    "rtn": ("poise.papers.skeleton2humanoid.rtn:RTN", "poise.papers.skeleton2humanoid.rtn:RTNConfig"),
+}
+
+
+class GapNetwork(TransitionNet, Protocol):
+    """A network that a file keeps."""
+
+    config: Any
+
+    def calibrate(self, root: Tensor, rot: Tensor, offsets: Tensor) -> None:
+        """Takes the scales of its inputs from windows."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Its tensors by name."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +304,7 @@ class InbetweenModel:
     """
 
     kind: str
-    net: Between | RTN
+    net: GapNetwork
     names: tuple[str, ...]
     offsets: Tensor
     fps: float
@@ -303,24 +319,20 @@ class InbetweenModel:
         return self.net.layout
 
 
-def make_net(
-    kind: str, layout: SkeletonLayout, config: BetweenConfig | RTNConfig, seed: int
-) -> Between | RTN:
+def make_net(kind: str, layout: SkeletonLayout, config: Any, seed: int) -> Any:
     """A fresh network with weights from the seed.
 
     Raises:
-        PoiseError: another kind than transformer and rtn.
+        PoiseError: another kind than those of `NETWORKS`.
     """
-    generator = torch.Generator().manual_seed(seed)
-    if kind == "transformer" and isinstance(config, BetweenConfig):
-        return Between(layout, config, generator=generator)
-    if kind == "rtn" and isinstance(config, RTNConfig):
-        return RTN(layout, config, generator=generator)
-    raise PoiseError(
-        f"there is no in-betweening network '{kind}' of such sizes",
-        hint=f"Known: {KINDS}",
-        code="unknown-choice",
-    )
+    net, sizes = map(imported, NETWORKS.get(kind, NETWORKS["transformer"]))
+    if kind not in NETWORKS or not isinstance(config, sizes):
+        raise PoiseError(
+            f"there is no in-betweening network '{kind}' of such sizes",
+            hint=f"Known: {', '.join(NETWORKS)}",
+            code="unknown-choice",
+        )
+    return net(layout, config, generator=torch.Generator().manual_seed(seed))
 
 
 def save_model(path: Path, model: InbetweenModel, half: bool = False) -> None:
@@ -366,9 +378,9 @@ def load_model(path: Path) -> InbetweenModel:
     try:
         said = meta["layout"]
         layout = SkeletonLayout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
-        kind = BetweenConfig if meta["net"] == "transformer" else RTNConfig
+        kind = imported(NETWORKS[meta["net"]][1])
         said = dict(meta["config"])
-        if kind is BetweenConfig:
+        if meta["net"] == "transformer":
             # Networks of earlier versions see no speeds and do not say so.
             said.setdefault("speeds", False)
         sizes = from_data(kind, said, path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import NamedTuple
 
@@ -13,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.led import REST, WAITS_S
 from poise.env.recovery.clips import GetUpPlanner, mixed, smooth
 from poise.env.recovery.planner import way_to_stand
+from poise.env.recovery.recovering import RecoveryPhases
 from poise.live.people import Offset
 from poise.metrics import LOST
 from poise.motion.rotations import facing, heading_angle
@@ -95,6 +94,11 @@ class RecoveryMotion:
     def on(self) -> bool:
         """Whether it is followed."""
         return self._frames is not None
+
+    @property
+    def over(self) -> bool:
+        """Whether its last frame was the last one given."""
+        return self._frames is not None and self._step + 1 >= len(self._frames)
 
     def plan(self, start: Tensor, place: Tensor | None, moves: Tensor | None, again: int = 0) -> None:
         """Begins to plan from `start (7 + n)` to standing at `place (7 + n)`, None for on the spot.
@@ -189,6 +193,8 @@ WALKS_M, STANDS = 4.0, 0.5
 HERE_M, TURNED = 0.25, 0.5
 #: s after a recovery motion began in which it is not lost.
 GRACE_S = 0.3
+#: The one character of its phases.
+ONLY = torch.zeros(1, dtype=torch.long)
 
 
 class CharacterState(NamedTuple):
@@ -214,8 +220,6 @@ class CharacterGoals:
         get_up: how the policy's library gets up.
         place: `(2)` m, where it stands at first.
         executor: plans recovery motions beside the loop; None plans at once, as tests do.
-        move: is told coordinates of the person, and those at which and facing as which they are to be
-            from now on.
 
     Attributes:
         doing: `EASE`, `TRACKS`, `FALLS` or `RETURNS`.
@@ -224,6 +228,8 @@ class CharacterGoals:
         anew: whether the last frame begins a motion from where the body is, so that no frames before it
             count any more.
         still: whether the last two frames were the same.
+        moved: coordinates of the person in the last step, and those at which and facing as which they
+            are to be from now on; None where the person's motion goes on as it did.
     """
 
     def __init__(
@@ -231,33 +237,35 @@ class CharacterGoals:
         get_up: GetUpPlanner,
         place: tuple[float, float],
         executor: Executor | None = None,
-        move: Callable[[Tensor, Tensor], None] | None = None,
     ):
-        self.get_up, self._move = get_up, move
+        self.get_up = get_up
+        self.moved: tuple[Tensor, Tensor] | None = None
         self.ease = get_up.recovery_clips.ease.clone()
         self.ease[:2] = torch.tensor(place, dtype=torch.float64)
-        self.doing = EASE
+        self._phases = RecoveryPhases(1, get_up.rate_hz, "cpu", hurries=True)
+        # Whether it is at ease while it tracks.
+        self._eases = True
         self.lost = self.falls = self.recovered = 0
         self.last = self.ease.clone()
         self.anew, self.still = False, True
-        self._way, self._passing, self._step = (
-            RecoveryMotion(get_up, executor),
-            Crossfade(get_up.rate_hz),
-            0,
-        )
-        self._grace = self._tries = 0
+        self._way, self._passing = RecoveryMotion(get_up, executor), Crossfade(get_up.rate_hz)
+        # Control steps in which a recovery motion that has begun is not lost yet.
+        self._grace = 0
         self._person: Tensor | None = None
         self._drift = torch.zeros(2, dtype=torch.float64)
         # Whether it is lost and not back yet, whether the person leapt, and how the last step broke.
         self._lost, self._jumped, self._was = False, False, ""
 
-    def on_move(self, move: Callable[[Tensor, Tensor], None]) -> None:
-        """Says what moves the person's motion, see `move`."""
-        self._move = move
+    @property
+    def doing(self) -> str:
+        """`EASE`, `TRACKS`, `FALLS` or `RETURNS`."""
+        now = (TRACKS, FALLS, RETURNS)[int(self._phases.doing)]
+        return EASE if self._eases and now == TRACKS else now
 
     def begin(self, frame: Tensor) -> None:
         """The character was set down on a frame."""
-        self.last, self.doing = frame.clone(), EASE
+        self.last, self._eases = frame.clone(), True
+        self._phases.begin(ONLY)
         self._way.leave()
         self._stand(frame)
         self._drift = torch.zeros(2, dtype=torch.float64)
@@ -265,7 +273,8 @@ class CharacterGoals:
 
     def follow(self, frame: Tensor) -> None:
         """The character is on its person's motion already, `frame` the last that its goal knows."""
-        self.last, self.doing = frame.clone(), TRACKS
+        self.last, self._eases = frame.clone(), False
+        self._phases.begin(ONLY)
         self._passing.end()
 
     def jump(self) -> None:
@@ -283,52 +292,39 @@ class CharacterGoals:
             person: the person's motion now, None without one.
             stalled: nothing new has come of the person; its pose rests meanwhile.
         """
-        before, self.anew = self.last, False
+        before, self.anew, self.moved = self.last, False, None
         self.last = self._next(person, body, stalled)
         self._drift = torch.zeros_like(self._drift) if self.anew else self.last[:2] - before[:2]
         self.still = bool((self.last - before).abs().max() < 1e-9)
         return self.last
 
     def _next(self, person: Tensor | None, body: CharacterState, stalled: bool) -> Tensor:
-        rate, self._step = self.get_up.rate_hz, self._step + 1
         step = self._moved(person)
-        stands = float(step.norm()) * rate < STANDS
-        if self.doing != FALLS and body.off_m > LOST and self._step > self._grace:
-            self.lost, self._lost = self.lost + (not self._lost), True
-            self._fall()
-        if self.doing == FALLS:
-            down = bool(self.get_up.lies(body.qpos))
-            rests = body.speed < REST or self._step > WAITS_S * rate or not down
-            if rests and not self._way.planned:
-                self.falls += down
-                near = person is not None and float((person[:2] - body.qpos[:2]).norm()) < WALKS_M
-                place = person if near and stands else None
-                # What has failed several times is not tried for ever.
-                self._way.plan(body.qpos.clone(), place, body.moves, self._tries)
-                self._tries += down
-            if not self._sets_out(RETURNS):
-                return self.last
-        if self.doing == RETURNS:
-            if (frame := self._way.next()) is not None:
-                return frame
-            self.recovered, self._lost, self._tries = self.recovered + self._lost, False, 0
+        stands = float(step.norm()) * self.get_up.rate_hz < STANDS
+        if self._watch(body, person if stands else None):
             self._stand(self.last)
-            self.doing = TRACKS
+            self._eases = False
             return self._join(person, step)
-        if stalled and self.doing == TRACKS and float(body.moves.norm()) > STANDS:
+        if self.doing == FALLS and not self._sets_out():
+            return self.last
+        if self.doing == FALLS:
+            self._phases.return_by(ONLY)
+        if self.doing == RETURNS and (frame := self._way.next()) is not None:
+            return frame
+        if stalled and not self._eases and float(body.moves.norm()) > STANDS:
             # It walks to a halt.
             self._way.plan(body.qpos.clone(), None, body.moves)
-            self.doing = EASE
+            self._eases = True
             self._stand(self.last)
-        if stalled and self.doing == EASE:
+        if stalled and self._eases:
             person, step = None, torch.zeros_like(step)
-        if (person is None) != (self.doing == EASE):
+        if (person is None) != self._eases:
             self._stand(self.last)
-            self.doing = EASE if person is None else TRACKS
+            self._eases = person is None
             self._way.leave()
             return self._join(person, step)
-        if self.doing == EASE and (self._way.on or self._way.planned):
-            if not self._way.on and not self._sets_out(EASE):
+        if self._eases and (self._way.on or self._way.planned):
+            if not self._way.on and not self._sets_out():
                 return self.last
             if (frame := self._way.next()) is not None:
                 return frame
@@ -363,16 +359,39 @@ class CharacterGoals:
             return "leapt"
         return "stalled" if before == "stalls" and not stalled else ""
 
+    def _watch(self, body: CharacterState, near: Tensor | None) -> bool:
+        """Looks whether the goal is lost, and plans the way back; whether that has come to its end.
+
+        near: the person where it stands, to which the character gets up if that is near.
+        """
+        self._grace = max(0, self._grace - 1)
+        down = bool(self.get_up.lies(body.qpos))
+        off = body.off_m > LOST and not self._grace
+        given = (torch.tensor([x]) for x in (off, body.speed, down, self._way.over))
+        lost, rests, back = (bool(x) for x in self._phases.watch(*given))
+        if lost:
+            self.lost, self._lost = self.lost + (not self._lost), True
+            self._way.leave()
+        if rests and not self._way.planned:
+            self.falls += down
+            if near is not None and float((near[:2] - body.qpos[:2]).norm()) >= WALKS_M:
+                near = None
+            # What has failed several times is not tried for ever.
+            self._way.plan(body.qpos.clone(), near, body.moves, int(self._phases.vain))
+        if back:
+            self.recovered, self._lost = self.recovered + self._lost, False
+            self._way.leave()
+        return back
+
     def _fall(self) -> None:
-        self.doing, self._step = FALLS, 0
+        self._phases.fall(ONLY)
         self._way.leave()
 
-    def _sets_out(self, doing: str) -> bool:
+    def _sets_out(self) -> bool:
         """Whether a recovery motion begins now."""
         if not self._way.begins():
             return False
-        self.doing, self._step, self.anew = doing, 0, True
-        self._grace = round(GRACE_S * self.get_up.rate_hz)
+        self.anew, self._grace = True, round(GRACE_S * self.get_up.rate_hz) + 1
         return True
 
     def _on(self) -> Tensor:
@@ -393,8 +412,7 @@ class CharacterGoals:
 
     def _put(self, person: Tensor, there: Tensor) -> None:
         """Lets the person's motion go on from elsewhere."""
-        if self._move is not None:
-            self._move(person, there)
+        self.moved = person.clone(), there.clone()
         turns = heading_angle(there[3:7]) - heading_angle(person[3:7])
         self._person = there if abs(turns) < 1e-6 else None
 

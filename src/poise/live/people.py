@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
-from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
 from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.kinematics import RetargetConfig, place_on_body
-from poise.kinematics.coords import wrapped
-from poise.kinematics.stream_noise import FadingFilter
-from poise.live import quats as q
-from poise.live.passage import FramePassage, Hinges, doublings, world_of
-from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, StreamPose, StreamTremble, leapt
+from poise.kinematics.coords import Hinges, wrapped
+from poise.kinematics.retarget.passage import Retargeter, world_of
+from poise.live.stream import PEOPLE, JitterBuffer, Packet, StreamPose, StreamTremble
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 
 #: s that are stood, m that the root may move meanwhile, and frames a second of what is measured.
 STAND_S, STILL_M, RATE = 2.0, 0.25, 30.0
@@ -63,7 +61,7 @@ class Offset:
 class Calibration:
     """Poses of one skeleton as coordinates of a body.
 
-    `move` lets the motion go on from elsewhere; at first it is where the source has it.
+    `where` lets the motion go on from elsewhere; at first it is where the source has it.
 
     Attributes:
         where: it is, against where the source has it.
@@ -72,7 +70,7 @@ class Calibration:
         scale: of the person's path.
     """
 
-    passage: FramePassage
+    passage: Retargeter
     hinges: Hinges
     feet: dict[int, np.ndarray]
     first: np.ndarray
@@ -84,7 +82,7 @@ class Calibration:
     @property
     def scale(self) -> float:
         """Size of the path on the body by that of the person."""
-        return self.passage.factor
+        return self.passage.scale.factor
 
     @classmethod
     def by(
@@ -104,7 +102,7 @@ class Calibration:
             PoiseError: a skeleton that is no human's.
         """
         on = place_on_body(clip, humanoid.table, example, RATE, how=how, near=humanoid)
-        passage = FramePassage(clip, example, None if how is None else how.scale)
+        passage = Retargeter.between(clip, example, factor=None if how is None else how.scale)
         feet = {j: turn.numpy() for j, turn in on.level.turns.items()}
         hinges = Hinges(example.skeleton, humanoid.table)
         out = cls(passage, hinges, feet, ease[7:])
@@ -120,7 +118,7 @@ class Calibration:
 
     def __call__(self, root_pos: np.ndarray, rot: np.ndarray) -> np.ndarray:
         """Coordinates `(7 + n)` of a pose, on the floor."""
-        root, world = self.passage(root_pos, rot)
+        root, world = self.passage(root_pos, world_of(self.passage.source, rot))
         for joint, turn in self.feet.items():
             world[joint] = q.mul(world[joint], turn)
         last = self.first if self._last is None else self._last
@@ -129,10 +127,6 @@ class Calibration:
         qpos[7:] += self.planted
         qpos[2] += self.floor
         return self.where(qpos)
-
-    def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """See `Offset.move`."""
-        self.where.move(seen, to)
 
 
 class StandingMeasure:
@@ -186,97 +180,22 @@ def calibrated(
         return f"{packet.person}: {problem.what}"
 
 
-#: s by which a clock goes back that began anew.
-ANEW_S = 2.0
+class Own(NamedTuple):
+    """A person's pose at the moment of a character's goal, on the person's own model.
 
+    Attributes:
+        skeleton: the model.
+        root_pos: `(3)` m.
+        rot: `(J, 4)` wxyz, local.
+        where: turns and moves the person's world to where the character is.
+        factor: size of the character's path by that of the person.
+    """
 
-class Steady:
-    """The poses of one person, in the order in which they come. One that does not tremble is given back
-    as it came."""
-
-    def __init__(self, skeleton: Skeleton):
-        self.skeleton = skeleton
-        self._fading: FadingFilter | None = None
-        self._last = np.zeros((len(skeleton), 4))
-        self._root = np.zeros(3)
-        self._times = deque[float](maxlen=16)
-        self._busy = Lock()
-
-    @property
-    def tremble(self) -> StreamTremble:
-        """What the person does now."""
-        fading = self._fading
-        return (
-            StreamTremble()
-            if fading is None
-            else StreamTremble(fading.noise.mm, fading.noise.hz, fading.late_s)
-        )
-
-    def __call__(
-        self, time_s: float, root: np.ndarray, rot: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The pose of `time_s` as it is known, None where a newer one came before it."""
-        with self._busy:
-            times = self._times
-            dt = time_s - times[0] if times else 0.0
-            if -ANEW_S <= dt <= 0.0 and times:
-                return None
-            if self._fading is None:
-                self._fading = self._begun(rot)
-            z = self._channels(root, rot)
-            leaps = bool(times) and leapt(self._root, root, dt)
-            if leaps or dt < 0.0:
-                times.clear()
-            times.appendleft(time_s)
-            self._root = root
-            if leaps:
-                self._fading.restart(z)
-                return root, rot
-            x = self._fading(z, dt)
-            return (root, rot) if x is z else (x[-3:], self._rotations(x))
-
-    def before(self) -> list[Earlier]:
-        """The poses before it, from the latest on, by all that came since; none if nothing trembles."""
-        if self._fading is None:
-            return []
-        known = zip(list(self._times)[1:], self._fading.before(), strict=False)
-        return [Earlier(t, x[-3:], self._rotations(x)) for t, x in known]
-
-    def _channels(self, root: np.ndarray, rot: np.ndarray) -> np.ndarray:
-        """`(C)`: rotations, each of the sign of the one before, and the root."""
-        flip = (rot * self._last).sum(-1, keepdims=True) < 0
-        self._last = np.where(flip, -rot, rot)
-        return np.concatenate((self._last.ravel(), root))
-
-    def _rotations(self, x: np.ndarray) -> np.ndarray:
-        return q.normalized(x[:-3].reshape(-1, 4))
-
-    def _begun(self, rot: np.ndarray) -> FadingFilter:
-        count = len(self.skeleton)
-        groups = np.append(np.repeat(np.arange(count), 4), [count] * 3)
-        at = self._places(np.append(rot.ravel(), np.zeros(3))[None])[0]
-        far = np.zeros((count, count))
-        for j in range(count):
-            above = j
-            while above >= 0:
-                far[above, j] = np.linalg.norm(at[j] - at[above])
-                above = self.skeleton.parents[above]
-        # A turn that errs by a variance v, the sum over its components, moves what is d m away by
-        # sqrt(8 v / 3) d.
-        weights = np.append(np.sqrt(8.0 / 3.0 * (far**2).mean(1)), 1.0)
-        return FadingFilter(groups, weights, self._places)
-
-    def _places(self, channels: np.ndarray) -> np.ndarray:
-        """`(T, J, 3)` m of channels `(T, C)`."""
-        skeleton = self.skeleton
-        rot = channels[:, :-3].reshape(len(channels), -1, 4).swapaxes(0, 1)
-        world = world_of(skeleton, rot)
-        above = np.maximum(skeleton.parents, 0)
-        out = q.rotate(world[above], np.asarray(skeleton.offsets)[:, None])
-        out[0] = channels[:, -3:]
-        for joints, parents in doublings(tuple(skeleton.parents)):
-            out[joints] = out[parents] + out[joints]
-        return out.swapaxes(0, 1)
+    skeleton: Skeleton
+    root_pos: np.ndarray
+    rot: np.ndarray
+    where: Offset
+    factor: float
 
 
 #: s without a packet after which a person is away, and after which it is forgotten.

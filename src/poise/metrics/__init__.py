@@ -14,12 +14,8 @@ from poise.metrics.plausibility import (
     help_audit,
     jerk,
     penetration,
-    physdiff_float,
-    physdiff_penetrate,
     s2h_foot_penetration,
     smoothness,
-    uhc_penetration,
-    uhc_skate,
 )
 from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
 from poise.metrics.tracking import (
@@ -79,15 +75,11 @@ __all__ = [
     "npss",
     "off_feet",
     "penetration",
-    "physdiff_float",
-    "physdiff_penetrate",
     "physics",
     "s2h_foot_penetration",
     "smoothness",
     "span_mask",
     "success",
     "success_rule",
-    "uhc_penetration",
-    "uhc_skate",
     "velocity_error",
 ]

@@ -12,6 +12,8 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
+from poise.errors import PoiseError
+
 #: Edges of the bands, as shares of half the frame rate, in which a floor is looked for; a band belongs
 #: to it while all groups together have less than `FLAT` times the power of the highest three.
 BANDS, FLAT = np.linspace(0.4, 1.0, 9), 1.25
@@ -31,6 +33,8 @@ HIGHEST_HZ = 15.0
 #: fast, at 30 frames/s. Less than this share of the way from frame to frame (rms) is none either: flips
 #: and sprints have it. Where the highest bands begin below this frequency (Hz) they hold motion.
 WHITE_MM, WHITE_SHARE, WHITE_HZ = 5.0, 0.08, 6.0
+#: White noise (mm) that leaves nothing of a motion.
+NOTHING_MM = 300.0
 #: Frames that a clip must have for its noise to be told.
 SHORTEST = 12
 #: So many trembles are looked for, one after another.
@@ -161,6 +165,17 @@ def _largest(values: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndar
         here = level == k
         out[here] = np.maximum(table[k][first[here]], table[k][stop[here] - 2**k])
     return out
+
+
+def only_noise(source: str, here: slice, size: str) -> PoiseError:
+    """The error of frames that jump about by that `size` each, so that nothing is left to be told."""
+    return PoiseError(
+        f"frames {here.start} to {here.stop - 1} jump about by {size} each: there is no motion to be "
+        "told",
+        source,
+        "Cut them off; --raw takes the file as it is",
+        code="only-noise",
+    )
 
 
 def white_mm(positions: np.ndarray, fps: float) -> float:

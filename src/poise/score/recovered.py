@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Recovery, Reference, TaskConfig
-from poise.env.led import LedGoal
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.clock import FALLEN, FAR, RecoveryClock
+from poise.env.recovery.recovering import Recovering
 from poise.errors import PoiseError
 from poise.score.episodes import simulate
 from poise.settings import plain
@@ -112,7 +112,7 @@ def recovery_card(
             before the trials goes on standing on its last frame. It waits for the fallen as in training.
         near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
         at_once: trials that are simulated side by side.
-        recovery_clips: what the policy is led back by (`env.led`), where the task is for that; by
+        recovery_clips: what the policy is led back by (`env.recovery`), where the task is for that; by
             default it is told a point.
 
     Raises:
@@ -171,7 +171,7 @@ def back_after(near: Tensor, stay: int) -> Tensor:
 class _Apart:
     """Observes how far the bodies are from their reference on average, m, after each step."""
 
-    def __init__(self, reference: Reference, clip: Tensor, led: LedGoal | None):
+    def __init__(self, reference: Reference, clip: Tensor, led: Recovering | None):
         self.reference, self.clip, self.led = reference, clip, led
         self.apart: list[Tensor] = []
         self._at: Tensor | None = None
@@ -181,7 +181,7 @@ class _Apart:
             ref = self.reference.gather(self.clip, env.frame if self._at is None else self._at)
             self.apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
         # Where a goal leads back, the frame that was told before the step.
-        self._at = None if self.led is None else self.led.frame.clone()
+        self._at = None if self.led is None else self.led.clips.frame.clone()
 
 
 def _trial(
@@ -198,7 +198,7 @@ def _trial(
     env.set_goal(env.goal.clips)
     obs = env.reset_to(clip * many, frame * many, kind * many)
     if recovery_clips is not None:
-        led = LedGoal(env.goal.clips, recovery_clips)
+        led = Recovering(env.goal.clips, recovery_clips)
         led.lead(torch.arange(env.num_envs), env.backend.state.qpos)
         obs = env.set_goal(led)
     seen = _Apart(reference, clip * many, led)

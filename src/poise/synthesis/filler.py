@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.kinematics.feet import Motion
 from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.steps import lock_feet, planted, stepped
 from poise.learn.between import Between
 from poise.learn.inbetween import Adaptation, InbetweenModel, adapt
 from poise.learn.transition import FilledGap, Known
@@ -31,9 +33,7 @@ from poise.motion.rotations import (
     slerp,
     unwrap_quats,
 )
-from poise.synthesis.footsteps import lock_feet, stepped
-from poise.synthesis.limits import Calmed, Feet, Motion, calmed, excess, flown, meet, sampled, spread
-from poise.synthesis.steps import planted
+from poise.synthesis.limits import Calmed, Feet, calmed, excess, flown, meet, sampled, spread
 
 
 class Gap(NamedTuple):
@@ -104,9 +104,6 @@ def split_gaps(keyframes: Sequence[int], longest: float) -> tuple[list[Gap], lis
     return gaps, inserted, warnings
 
 
-Path = tuple[Tensor, Tensor]
-
-
 @dataclass(frozen=True, eq=False)
 class OtherRig:
     """The passage between a clip's skeleton and a network's. A path is root `(T, 3)` m and rot
@@ -129,15 +126,15 @@ class OtherRig:
         back = Retargeter(joints, there.there, there.here, there.scale.inverse())
         return OtherRig(clip, example, there, back)
 
-    def to_model(self, path: Path) -> Path:
+    def to_model(self, path: Motion) -> Motion:
         """A path of the clip's skeleton on the network's."""
         return self._passed(self.clip, self.there, path)
 
-    def to_clip(self, path: Path) -> Path:
+    def to_clip(self, path: Motion) -> Motion:
         """A path of the network's skeleton on the clip's."""
         return self._passed(self.example, self.back, path)
 
-    def changed(self, known: Path, filled: Path) -> Path:
+    def changed(self, known: Motion, filled: Motion) -> Motion:
         """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it."""
         before, after = self.to_clip(self.to_model(known)), self.to_clip(filled)
         root = known[0] + after[0] - before[0]
@@ -145,7 +142,7 @@ class OtherRig:
         return root, unwrap_quats(normalize(quat_mul(known[1], turn)))
 
     @staticmethod
-    def _passed(clip: Clip, passage: Retargeter, path: Path) -> Path:
+    def _passed(clip: Clip, passage: Retargeter, path: Motion) -> Motion:
         skeleton = clip.skeleton
         world = ClipWorld(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
         rot, root = passage.transfer(world)
@@ -352,7 +349,8 @@ class Filler:
             self._finish(root, rot, gap, contact if holds else contact[:, :0])
             if flight is not None and feet == "held":
                 here, off = slice(a, b + 1), (before > 0.0, after > 0.0)
-                moved = planted(self.own.skeleton, (root[here], rot[here]), off, flight, self.own.fps)
+                how = off, flight.lean, flight.falls, self.own.fps
+                moved = planted(self.own.skeleton, (root[here], rot[here]), *how)
                 root[here], rot[here] = moved
             if feet == "stepped":
                 here = slice(a, b + 1)

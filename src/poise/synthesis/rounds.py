@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from poise.kinematics.feet import Motion
 from poise.kinematics.repair.doctor import examine, heal
 from poise.kinematics.repair.faults import KINDS
 from poise.motion import Clip
 from poise.motion.rotations import slerp
 from poise.synthesis.filler import Filler, Gap
-from poise.synthesis.limits import Calmed, Feet, Motion, excess
+from poise.synthesis.limits import Calmed, Feet, excess
 
 #: Kinds of faults that frames between keyframes can have; the others are of the file or its skeleton.
 JUDGED = (

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
-from poise.env.generator import EndlessGoal, Steering
+from poise.env.generator import GeneratorGoal, Steering
+from poise.env.recovery.recovering import Recovering
 from poise.errors import PoiseError
 from poise.jobs.endless.dreamt import (
     ClipMaker,
@@ -122,9 +123,11 @@ def dream(
         for writer in writers:
             writer.discard()
     return Dreamt(
-        tracker, body, tuple(characters),
-        tuple((i, s / rate) for i, s in goal.falls), tuple((i, s / rate) for i, s in goal.back),
-        tuple((i, s / rate) for i, s in goal.reached), config, (*notes, *goal.notes), paths, interrupted,
+        tracker=tracker, body=body, characters=tuple(characters),
+        lost=tuple((i, s / rate) for i, s in goal.lost),
+        back=tuple((i, s / rate) for i, s in goal.back),
+        reached=tuple((i, s / rate) for i, s in goal.reached), config=config,
+        notes=(*notes, *goal.notes), paths=paths, interrupted=interrupted,
     )  # fmt: skip
 
 
@@ -166,21 +169,22 @@ def names_of(out: Path, count: int) -> list[Path]:
 def _go_about(
     tracker: Tracker, made: Kinematic, config: Dream, pasts: Tensor, steps: int, seen: _Seen,
     notes: list[str],
-) -> EndlessGoal:  # fmt: skip
+) -> Recovering:  # fmt: skip
     """Simulates until all steps are made or `seen` has seen enough; the goal that was followed."""
     steering = Steering(config.targets, config.count > 1)
 
-    def goal(worlds: int, plans: bool) -> EndlessGoal:
+    def goal(worlds: int, plans: bool) -> Recovering:
         clips = tracker.recovery_clips if config.recover else None
         # Each has its own wishes; where there is somewhere to go, that alone counts.
         wishing = made.wishing(0.0 if config.targets else config.label_seconds, worlds)
         lead = max(config.lookahead.horizon, *tracker.config.window, 1) + 1
-        own = EndlessGoal(
-            wishing, tracker.humanoid, tracker.config.sim.control_hz, clips, worlds, seed=config.seed,
+        motion = GeneratorGoal(
+            wishing, tracker.humanoid, tracker.config.sim.control_hz, worlds, seed=config.seed,
             lead=lead, plans=plans, steering=steering,
             pasts=pasts if plans else pasts[:1].expand(worlds, -1, -1),
             simulated=config.past == "simulated",
         )  # fmt: skip
+        own = Recovering(motion, clips, plans=plans)
         own.draw(torch.arange(worlds))
         return own
 
@@ -225,7 +229,7 @@ class _Seen:
         goal: what they follow. stopped: whether Ctrl-C was pressed.
     """
 
-    goal: EndlessGoal
+    goal: Recovering
     stopped: Callable[[], bool]
 
     def __init__(
@@ -241,7 +245,7 @@ class _Seen:
         """Keeps a control step; the state before the first one is that of the past, which is known."""
         if step == 0:
             return self.stopped()
-        asked = self.goal.coordinates(self._all, self.goal.at)[0]
+        asked = self.goal.start(None)[0]
         for k, character in enumerate(self.characters):
             character.done.append(env.backend.state.qpos[k].cpu().numpy())
             character.asked.append(asked[k].cpu().numpy())

@@ -10,7 +10,6 @@ from poise.settings import Checked, part
 if TYPE_CHECKING:
     from poise.jobs.library.clips import LibraryConfig
     from poise.learn.between import BetweenConfig, BetweenTraining
-    from poise.learn.rtn import RTNConfig, RTNTraining
     from poise.score.gaps import Protocol
 
 Contacts = Literal["harvey", "two-stage", "floor"]
@@ -50,8 +49,8 @@ class Inbetween(Checked):
     reading: LibraryConfig | None = part("poise.jobs.library.clips:LibraryConfig", made=False)
     between: BetweenConfig = part("poise.learn.between:BetweenConfig")
     between_training: BetweenTraining = part("poise.learn.between:BetweenTraining")
-    rtn: RTNConfig = part("poise.learn.rtn:RTNConfig")
-    rtn_training: RTNTraining = part("poise.learn.rtn:RTNTraining")
+    rtn: Any = part("poise.papers.skeleton2humanoid.rtn:RTNConfig")
+    rtn_training: Any = part("poise.papers.skeleton2humanoid.rtn:RTNTraining")
 
     @classmethod
     def paper(cls, **changes: Any) -> Inbetween:
@@ -59,9 +58,9 @@ class Inbetween(Checked):
 
         Its alpha is stated nowhere and neither is the width of the LSTM; both are ours.
         """
-        from poise.learn.rtn import RTNConfig, RTNTraining
         from poise.score.gaps import LAFAN1
 
+        plain = cls()
         own: dict[str, Any] = {
             "net": "rtn",
             "name": LAFAN1.name,
@@ -71,8 +70,11 @@ class Inbetween(Checked):
             "ema": 0.0,
             "mirror": False,
             "stretch": 1.0,
-            "rtn": RTNConfig(encoder=(512, 256), decoder=(512, 256), past=10, longest=30, noise=0.5),
-            "rtn_training": RTNTraining(
+            "rtn": replace(
+                plain.rtn, encoder=(512, 256), decoder=(512, 256), past=10, longest=30, noise=0.5
+            ),
+            "rtn_training": replace(
+                plain.rtn_training,
                 batch=32,
                 lr=1e-3,
                 decay=False,
@@ -124,10 +126,9 @@ class Inbetween(Checked):
 def small(config: Inbetween) -> Inbetween:
     """A network that trains in minutes, for trials and tests."""
     from poise.learn.between import BetweenConfig
-    from poise.learn.rtn import RTNConfig
 
     return replace(
         config,
         between=BetweenConfig(width=64, layers=2, heads=4, feedforward=128, latent=4),
-        rtn=RTNConfig(hidden=64, encoder=(64, 32), decoder=(64, 32)),
+        rtn=replace(config.rtn, hidden=64, encoder=(64, 32), decoder=(64, 32)),
     )

@@ -41,7 +41,6 @@ from poise.learn.inbetween import (
     save_model,
     train_inbetween,
 )
-from poise.learn.rtn import RTN, RTNObjective
 from poise.learn.transition import SkeletonLayout
 from poise.learn.windows import FrameData, Sampler
 from poise.motion import Clip, Skeleton
@@ -56,7 +55,7 @@ from poise.motion.windows import (
     without_still_root,
 )
 from poise.score.gaps import TestSet, deviation, evaluate, test_set
-from poise.settings import from_data, to_data
+from poise.settings import from_data, imported, to_data
 
 
 def library_bank(
@@ -236,7 +235,8 @@ def objective(task: Task, steps: int) -> Objective:
     if isinstance(net, Between):
         return BetweenObjective(net, c.between_training, task.data.std, steps)
     critics = make_generator(c.seed, "critics")
-    return RTNObjective(net, c.rtn_training, task.data.std, steps, critics)
+    recurrent = imported("poise.papers.skeleton2humanoid.rtn:RTNObjective")
+    return recurrent(net, c.rtn_training, task.data.std, steps, critics)
 
 
 def steps_in(task: Task, minutes: float, trials: int = 6) -> int:
@@ -320,7 +320,6 @@ def train(
 def as_model(task: Task, trainer: InbetweenTrainer) -> InbetweenModel:
     """The averaged network with what is needed to use it."""
     net, c = copy.deepcopy(trainer.averaged).eval(), task.config
-    assert isinstance(net, Between | RTN)
     meta: dict[str, Any] = {
         "name": c.name, "seed": c.seed, "step": trainer.step, "steps": trainer.steps,
         "seconds": round(trainer.seconds, 1), "clips": len(task.bank.clips),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,8 @@ from poise.errors import PoiseError
 from poise.jobs.library.clips import LibraryConfig, Target
 from poise.jobs.library.folder import library_of, split
 from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips, try_recovery
-from poise.jobs.perpetual.stage_order import Progress, Stage
-from poise.jobs.perpetual.stage_start import staged
 from poise.jobs.perpetual.stage_trainer import StageTrainer
+from poise.jobs.perpetual.stages import Progress, Stage, staged
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, write_run
 from poise.jobs.warm_start import SMALL_STEP, TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, WarmStart, load_checkpoint
@@ -114,33 +114,27 @@ WAYS = "ways"
 #: What a policy that goes on keeps whatever is stated: its weights are bound to what it observes, does
 #: and is, and `going_on` decides how it starts.
 KEPT = frozenset((
-    "goal", "shape", "shapes", "heading", "window", "filter", "action", "faithful", "style", "start",
-    "single", "max_primitives", "recovery", "lateral", "combine", "weights", "clone", "multiplicative",
-    "progressive", "single_hidden", "composer_hidden", "composer_clone", "expert", "trajopt",
-    "help_start", "help_share", "body", "sim", "ppo.policy_hidden", "ppo.value_hidden", "ppo.activation",
-    "ppo.learn_std", "ppo.obs_clip",
+    "goal", "shape", "shapes", "heading", "window", "filter", "action", "faithful", "style", "recovery",
+    "clone", "single_hidden", "expert", "help_start", "help_share", "body", "sim", "ppo.policy_hidden",
+    "ppo.value_hidden", "ppo.activation", "ppo.learn_std", "ppo.obs_clip",
 ))  # fmt: skip
 
 
-def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
+def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    the networks, the seed, and whether and how recovery is learned. Where it is, the policy stays as it
-    is, the first primitive of more, unless one network is to learn both. Observations are clipped no
-    nearer than at `WIDE` deviations. Settings that are not in `KEPT` may be changed afterwards.
-
-    returns: the policy tracks recovery motions already, so that more primitives learn what it fails, and
-        none of its own is needed for recovery.
+    the worlds, the seed, and whether and how recovery is learned. Observations are clipped no nearer
+    than at `WIDE` deviations. Settings that are not in `KEPT` may be changed afterwards.
 
     Raises:
         PoiseError: the policy is made of primitives.
     """
-    if not policy.single and policy.multiplicative:
+    if policy.primitives:
         raise PoiseError(
             "the policy is made of primitives and a composer, which are frozen and cannot go on",
             hint="Go on from a single network, or resume its run",
             code="policy-of-primitives",
         )
-    done = {"expert": False, "trajopt": None, "help_start": 0.0}
+    done = {"expert": False, "help_start": 0.0}
     asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery", "noise")}
     quick = policy.recovering.quick or wanted.recovering.quick
     demonstrations = wanted.recovering.demonstrations
@@ -148,14 +142,6 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
     # The step size that the policy ended with is too small for learning something new.
     step = SMALL_STEP if wanted.recovery else min(policy.ppo.policy_lr, SMALL_STEP)
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE), policy_lr=step)
-    if wanted.recovery and not wanted.single:
-        # Primitives have the sizes of the network that becomes the first of them.
-        asked |= {"single": False, "multiplicative": True, "progressive": True}
-        if returns and wanted.recovering.demonstrations:
-            asked["recovering"] = replace(asked["recovering"], primitive="first")
-            asked["max_primitives"] = wanted.max_primitives
-        hidden = policy.single_hidden if policy.single else ppo.policy_hidden
-        ppo = replace(ppo, policy_hidden=hidden)
     return replace(policy, ppo=ppo, **done, **asked)
 
 
@@ -212,7 +198,7 @@ def begin(
         )
     held = (folder / RUN_FILE).exists()
     if held:
-        held_run(folder, RECIPE["name"], config, config_of, library, source)
+        held_run(folder, RECIPE["name"], config, partial(config_of, kind=type(config)), library, source)
     table = None
     if earlier is not None:
         table = earlier.target.table
@@ -242,7 +228,8 @@ def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu
     Raises:
         PoiseError: other settings, another source of clips, or another recipe.
     """
-    imitation = _rebuilt(held_run(folder, RECIPE["name"], config, config_of, source=source))
+    read = partial(config_of, kind=type(config))
+    imitation = _rebuilt(held_run(folder, RECIPE["name"], config, read, source=source), type(config))
     imitation.check(config.num_envs, device)
     return imitation
 
@@ -260,10 +247,11 @@ def reopen(file: RunFile) -> Imitation:
     return replace(imitation, config=config, task=task(config, imitation.humanoid), recovery_clips=None)
 
 
-def _rebuilt(file: RunFile) -> Imitation:
+def _rebuilt(file: RunFile, kind: type[Perpetual] | None = None) -> Imitation:
     told = under(WAYS, file.tensors)
     known = RecoveryClips.of(told) if told else None
-    return build(file.library(), config_of(file.meta["config"], file.path), file.table(), known)
+    config = config_of(file.meta["config"], file.path, kind)
+    return build(file.library(), config, file.table(), known)
 
 
 def knows_recovery(folder: Path) -> bool:

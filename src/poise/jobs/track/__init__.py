@@ -2,7 +2,6 @@
 
 from poise.jobs.track.controllers import ResetOnFail, look_ahead
 from poise.jobs.track.settings import TrackConfig
-from poise.jobs.track.tracked import Clean, Tracked, write
 from poise.jobs.track.tracking import (
     imitation_of,
     side_by_side,
@@ -10,13 +9,10 @@ from poise.jobs.track.tracking import (
 )
 
 __all__ = [
-    "Clean",
     "ResetOnFail",
     "TrackConfig",
-    "Tracked",
     "imitation_of",
     "look_ahead",
     "side_by_side",
     "track",
-    "write",
 ]

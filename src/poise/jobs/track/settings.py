@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from poise.errors import PoiseError
-from poise.jobs.track.direction import Direction
-from poise.jobs.track.pushed import PushConfig
-from poise.jobs.track.simulation import Retake
-from poise.kinematics.supports import Support
-from poise.motion.noise import Noise
-from poise.plan import LookaheadConfig, SamplingConfig
-from poise.settings import Range, validate
+from poise.settings import Range, part, validate
+
+if TYPE_CHECKING:
+    from poise.jobs.track.direction import Direction
+    from poise.jobs.track.pushed import PushConfig
+    from poise.jobs.track.simulation import Retake
+    from poise.kinematics.supports import Support
+    from poise.motion.noise import Noise
+    from poise.plan import LookaheadConfig, SamplingConfig
 
 #: Characters in one world.
 MOST = 64
 #: Which controller does a motion.
 Controller = Literal["auto", "policy", "lookahead", "search"]
+#: The body that a motion is done on.
+BodyChoice = Literal["policy", "own"]
+#: What becomes of a clip in place.
+Mode = Literal["auto", "keep", "travel"]
 
 
 @dataclass(frozen=True)
@@ -25,96 +32,58 @@ class TrackConfig:
     """How a motion is tracked.
 
     Attributes:
-        noise, seed: what is done to the input first, see `motion.noise`.
-        reset_on_fail: a character that failed is put back onto the reference.
-        recover: it gets up, comes back and goes on, while the motion waits, see `env.led`; for one
-            character.
+        noise: errors of a pose estimator on the input, see `motion.noise`.
+        seed: seed of the noise, and of what lookahead and search draw.
+        reset_on_fail: put a character that is 0.5 m off back onto the motion, and go on.
+        recover: a character that is 0.5 m off gets up, walks back and goes on where the motion waits for
+            it, see `env.recovery`.
         smooth_hz: cut-off of a low-pass on keypoints.
-        count: characters that do the motion side by side in one world, see `track.crowd`.
-        controller: "policy" acts alone, "lookahead" simulates what it may do before it acts
-            (`plan.lookahead`), "search" looks for the whole motion (`plan.sampling`), for one character;
-            "auto" looks ahead, and searches what is lost so, but for `recover` and several clips.
+        count: characters that do the motion side by side in one world, where they may collide.
+        controller: policy acts alone, at once; lookahead tries in copies of the character before it
+            acts, which is nearer to the motion and cleaner; search lets many characters try the whole
+            motion at once. auto looks ahead, and searches what is lost so.
         lookahead: how it looks ahead; its seed is `seed`.
         search: how it searches; its seed is `seed`.
-        threads: cores of lookahead and search, 0 is all of them.
-        body: "policy" is the one that it was trained on, onto which motions are retargeted; "own" has
-            the same bodies and hinges with the lengths and masses of the skeleton that came in.
+        threads: cores for lookahead and search; 0 is all.
+        body: policy is the body that it was trained on, onto which the motion is retargeted; own has the
+            same joints with the lengths and masses of the skeleton that came in.
         supports: "auto" puts boxes where a single motion sits, leans or steps on something
-            (`kin.supports`), "none" leaves the floor alone; or supports beside the motion that comes in.
-        direction: what counts more, stays put or is touched; for a single clip.
-        retake: a part that is simulated anew, while the rest stays as an earlier result has it; for a
-            single clip.
-        push: a push in it, to which the character gives way; for one character and a single clip, which
-            no search looks for.
-        in_place: what becomes of a clip in place, see `track.in_place`.
+            (`kinematics.supports`), "none" leaves the floor alone; or supports beside the motion that
+            comes in.
+        direction: parts that count more, stay put or are touched.
+        retake: a part that is simulated anew, while the rest stays as an earlier result has it.
+        push: a push in it, to which the character gives way.
+        in_place: a clip that walks in place is simulated with the travel that its feet tell. auto writes
+            it in place again, a loop as a loop; travel writes it with its travel; keep simulates it as
+            it is.
     """
 
-    noise: tuple[Noise, ...] = ()
+    noise: tuple[Noise, ...] = field(default=(), metadata={"place": "poise.motion.noise:Noise"})
     seed: int = 0
     reset_on_fail: bool = False
     recover: bool = False
     smooth_hz: float | None = None
     count: Annotated[int, Range(1, MOST, unit="characters")] = 1
     controller: Controller = "auto"
-    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
-    search: SamplingConfig = field(default_factory=SamplingConfig)
-    threads: int = 0
-    body: Literal["policy", "own"] = "policy"
-    supports: Literal["auto", "none"] | tuple[Support, ...] = "auto"
-    direction: Direction = field(default_factory=Direction)
-    retake: Retake | None = None
-    push: PushConfig | None = None
+    lookahead: LookaheadConfig = part("poise.plan:LookaheadConfig")
+    search: SamplingConfig = part("poise.plan:SamplingConfig")
+    threads: Annotated[int, Range(0)] = 0
+    body: BodyChoice = "policy"
+    supports: Literal["auto", "none"] | tuple[Support, ...] = field(
+        default="auto", metadata={"place": "poise.kinematics.supports:Support"}
+    )
+    direction: Direction = part("poise.jobs.track.direction:Direction")
+    retake: Retake | None = part("poise.jobs.track.simulation:Retake", made=False)
+    push: PushConfig | None = part("poise.jobs.track.pushed:PushConfig", made=False)
     in_place: Mode = "auto"
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.recover and (self.reset_on_fail or self.count > 1):
-            what = "several characters" if self.count > 1 else "one that is put back onto the motion"
-            raise PoiseError(
-                f"only a single character comes back by itself, not {what}", code="single-character-only"
-            )
-        if self.controller == "search" and (self.recover or self.reset_on_fail or self.count > 1):
-            what = "several characters" if self.count > 1 else "one that comes or is put back"
-            raise PoiseError(
-                f"a motion is searched for a single character, not {what}", code="single-character-only"
-            )
-
-        if isinstance(self.supports, tuple) and (self.recover or self.count > 1):
-            what = "several characters" if self.count > 1 else "one that comes back by itself"
-            raise PoiseError(
-                f"supports are for a single character, not {what}", code="single-character-only"
-            )
-        if self.direction and (self.recover or self.count > 1):
-            what = "several characters" if self.count > 1 else "one that comes back by itself"
-            raise PoiseError(
-                f"weights, pins and touches are for a single character, not {what}",
-                code="single-character-only",
-            )
-        if self.retake is not None:
-            others = {
-                "one that comes or is put back": self.recover or self.reset_on_fail,
-                "several characters": self.count > 1,
-                "a motion with noise": bool(self.noise),
-                "a search, which looks for the whole motion": self.controller == "search",
-            }
-            if any(others.values()):
-                what = next(name for name, asked in others.items() if asked)
+        for rule in RULES:
+            other = next((r for r in RULES if r.name in rule.alone and r.asked(self)), None)
+            if other is not None and rule.asked(self):
                 raise PoiseError(
-                    f"a range is for a single character that tracks, not {what}",
-                    code="single-character-only",
-                )
-        if self.push is not None:
-            others = {
-                "one that comes or is put back": self.recover or self.reset_on_fail,
-                "several characters": self.count > 1,
-                "a motion with noise": bool(self.noise),
-                "a part that is simulated anew": self.retake is not None,
-                "a search, which would know of it": self.controller == "search",
-            }
-            if any(others.values()):
-                what = next(name for name, asked in others.items() if asked)
-                raise PoiseError(
-                    f"a push is for a single character that tracks, not {what}",
+                    f"{rule.subject} for a single character that tracks, not {other.called}",
                     code="single-character-only",
                 )
         if self.body == "own" and self.recover:
@@ -129,21 +98,12 @@ class TrackConfig:
         Raises:
             PoiseError: no clips, or several with what is for a single one.
         """
-        alone = {
-            "several characters are": self.count > 1, "noise is": bool(self.noise),
-            "putting a character back is": self.reset_on_fail,
-            "a search is": self.controller == "search", "a body of its own is": self.body == "own",
-            "weights, pins and touches are": bool(self.direction),
-            "a range is": self.retake is not None,
-            "a push is": self.push is not None,
-            "a support is": isinstance(self.supports, tuple),
-        }  # fmt: skip
         if not clips:
             raise PoiseError("there is no clip to track", code="no-clips")
-        if clips > 1 and any(alone.values()):
-            what = next(name for name, asked in alone.items() if asked)
+        rule = next((r for r in RULES if r.single and r.asked(self)), None)
+        if clips > 1 and rule is not None:
             raise PoiseError(
-                f"{what} for a single clip, and {clips} were given", code="single-clip-only"
+                f"{rule.subject} for a single clip, and {clips} were given", code="single-clip-only"
             )
 
     @property
@@ -158,6 +118,80 @@ class TrackConfig:
         return self.controller == "search" or (self.controller == "auto" and single)
 
 
-#: What becomes of a clip in place: "keep" simulates it as it is, "travel" writes it
-#: with its travel, "auto" writes it in place again.
-Mode = Literal["auto", "keep", "travel"]
+@dataclass(frozen=True)
+class Rule:
+    """What a feature of tracking is not combined with.
+
+    Attributes:
+        name: of the feature.
+        asked: whether settings ask for it.
+        subject: what begins a sentence about it: "a push is".
+        called: what ends a sentence of another one: "a motion with noise".
+        alone: features that it is not combined with.
+        single: whether it is for a single clip.
+    """
+
+    name: str
+    asked: Callable[[TrackConfig], bool]
+    subject: str
+    called: str
+    alone: tuple[str, ...] = ()
+    single: bool = True
+
+
+_OTHERS = ("recover", "reset", "count")
+#: What cannot be combined, each feature once; the first that meets another one is told.
+RULES = (
+    Rule("count", lambda c: c.count > 1, "several characters are", "several characters"),
+    Rule("noise", lambda c: bool(c.noise), "noise is", "a motion with noise"),
+    Rule(
+        "reset",
+        lambda c: c.reset_on_fail,
+        "putting a character back is",
+        "one that is put back onto the motion",
+    ),
+    Rule(
+        "recover",
+        lambda c: c.recover,
+        "coming back is",
+        "one that comes back by itself",
+        ("count", "reset"),
+        single=False,
+    ),
+    Rule(
+        "search",
+        lambda c: c.controller == "search",
+        "a search is",
+        "a search, which looks for the whole motion",
+        _OTHERS,
+    ),
+    Rule("body", lambda c: c.body == "own", "a body of its own is", "a body of its own"),
+    Rule(
+        "direction",
+        lambda c: bool(c.direction),
+        "weights, pins and touches are",
+        "one that is directed",
+        ("recover", "count"),
+    ),
+    Rule(
+        "retake",
+        lambda c: c.retake is not None,
+        "a range is",
+        "a part that is simulated anew",
+        (*_OTHERS, "noise", "search"),
+    ),
+    Rule(
+        "push",
+        lambda c: c.push is not None,
+        "a push is",
+        "one that is pushed",
+        (*_OTHERS, "noise", "retake", "search"),
+    ),
+    Rule(
+        "supports",
+        lambda c: isinstance(c.supports, tuple),
+        "a support is",
+        "one with supports",
+        ("recover", "count"),
+    ),
+)

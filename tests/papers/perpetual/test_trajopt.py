@@ -11,8 +11,7 @@ import torch
 
 from poise.env import ImitationEnv, Reference
 from poise.metrics import mpjpe_global
-from poise.plan import LqrTeacher, TrajectoryOptimizer, TrajOptConfig
-from poise.plan.trajopt import segments
+from poise.papers.perpetual.trajopt import LqrTeacher, TrajectoryOptimizer, TrajOptConfig, segments
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
 from poise.sim import SimConfig
@@ -27,8 +26,8 @@ def search(imitation: Imitation, config: TrajOptConfig = SHORT) -> TrajectoryOpt
 
 
 def test_help_ends_where_the_motion_is_followed(make_task) -> None:
-    found = search(make_task(swing(0.5, name="calm")), replace(SHORT, iterations=8, less=0.4))
-    stats = [found.iterate() for _ in range(8)]
+    found = search(make_task(swing(0.4, name="calm")), replace(SHORT, iterations=6, less=0.3))
+    stats = [found.iterate() for _ in range(6)]
     assert found.done and stats[-1].unhelped > 0.9
     assert stats[-1].help_n < 0.2 * stats[0].help_n + 1.0 and stats[-1].error_m < 0.1
 
@@ -44,7 +43,7 @@ def test_what_went_astray_begins_again_on_its_reference(make_task) -> None:
 
 
 def test_a_search_that_goes_on_finds_the_same(make_task) -> None:
-    imitation = make_task(swing(0.5, name="calm"), swing(0.6, speed=1.0, name="walk"))
+    imitation = make_task(swing(0.2, name="calm"), swing(0.3, speed=1.0, name="walk"))
     whole, first, then = (search(imitation) for _ in range(3))
     for _ in range(2):
         whole.iterate()
@@ -62,7 +61,7 @@ def _exact(s: TrajectoryOptimizer) -> list[tuple[str, torch.Tensor]]:
 def test_clips_are_found_as_if_each_were_alone(make_task, monkeypatch: pytest.MonkeyPatch) -> None:
     clips = swing(0.5, name="calm"), swing(0.6, speed=1.0, name="walk")
     together = search(make_task(*clips))
-    monkeypatch.setattr("poise.plan.trajopt.ROWS", 5)
+    monkeypatch.setattr("poise.papers.perpetual.trajopt.ROWS", 5)
     apart = search(make_task(*clips))
     assert len(together._parts()) == 1 or len(apart._parts()) == 2
     together.iterate()

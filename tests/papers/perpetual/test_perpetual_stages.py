@@ -14,8 +14,8 @@ import torch
 from poise.jobs.perpetual import run as perpetual_result
 from poise.jobs.perpetual import stage_trainer as perpetual_judge
 from poise.jobs.perpetual.run import PerpetualResult, begin, train
-from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.perpetual.stage_trainer import StageTrainer
+from poise.jobs.perpetual.stages import Progress
 from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, ConvergenceConfig, IterationStats, Trainer, Until, load_policy
 from poise.learn.composer import Composer

@@ -1,17 +1,19 @@
-"""What pages and programs may send, checked before anything else sees it; settings of live motion. The
-protocol is described in docs/live.md."""
+"""Messages of pages and programs, checked before anything else sees them, those that they are sent, and
+the settings of live motion. The protocol is described in docs/live.md."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
+from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
@@ -251,3 +253,60 @@ class LiveConfig:
         if self.lookahead > self.characters:
             what = f"lookahead must lie in 0 to {self.characters} characters, got {self.lookahead}"
             raise PoiseError(what, "LiveConfig", code="out-of-range")
+
+
+#: Version, step, simulated time, characters, bodies; then what each does, and numbers.
+HEAD = struct.Struct("<IIdHH")
+
+
+def packed(
+    step: int,
+    time_s: float,
+    doing: Sequence[int],
+    bodies: np.ndarray,
+    goals: np.ndarray,
+    ball: np.ndarray,
+) -> bytes:
+    """Little-endian: version u32, step u32, time f64, K u16, B u16; K u8 what each character does,
+    filled up to a multiple of 4; f32 `(K, B, 7)` of the bodies, as many of the goals, 7 of the ball."""
+    k, b = bodies.shape[:2]
+    head = HEAD.pack(VERSION, step, time_s, k, b) + bytes(doing) + bytes(-k % 4)
+    return head + b"".join(np.ascontiguousarray(x, "<f4").tobytes() for x in (bodies, goals, ball))
+
+
+def as_json(time_s: float, doing: Sequence[str], bodies: np.ndarray) -> str:
+    """The same for programs: places m and rotations wxyz of the simulated bodies."""
+    characters = [
+        {
+            "doing": what,
+            "pos": np.round(rows[:, :3].astype(float), 5).tolist(),
+            "quat": np.round(rows[:, 3:].astype(float), 5).tolist(),
+        }
+        for what, rows in zip(doing, bodies, strict=True)
+    ]
+    return json.dumps({"v": VERSION, "type": "bodies", "time": time_s, "characters": characters})
+
+
+#: What characters do, in the order of the numbers in frames.
+DOING = ("at ease", "tracks", "falls", "gets up")
+
+
+def hello_of(table: BodyTable, count: int, rate_hz: float, more: Mapping[str, Any]) -> dict[str, Any]:
+    """What a page needs to draw the characters.
+
+    more: of it, such as whether there is a recorder.
+    """
+    return {
+        "characters": count,
+        "rate": rate_hz,
+        "bodies": [r.name for r in table.rows],
+        "parents": [r.parent for r in table.rows],
+        "shapes": [
+            {"body": i, "kind": g.kind, "size": list(g.size), "pos": list(g.pos), "quat": list(g.quat)}
+            for i, row in enumerate(table.rows)
+            for g in row.geoms
+        ],
+        "ball": 0.12,
+        "doing": list(DOING),
+        **more,
+    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated
 
@@ -17,8 +18,8 @@ from poise.env.env import ImitationEnv
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
+from poise.papers.perpetual.lqr import Regulator, driven, linearise, regulate
 from poise.plan.expert import ExpertConfig, make_plan
-from poise.plan.lqr import Regulator, driven, linearise, regulate
 from poise.settings import Limit, Positive, Range, validate
 from poise.sim import CpuBackend, SimConfig, alone, difference
 
@@ -29,7 +30,7 @@ class TrajOptConfig:
 
     Attributes:
         iterations: number of iterations; 0 optimises nothing.
-        sizes: rad, of the differences in the first and in the last iteration, see `plan.lqr`.
+        sizes: rad, of the differences in the first and in the last iteration, see `lqr`.
         segment_s: seconds of a shooting segment; each segment chooses its own step.
         place_m: m, error of the root's place that costs 1.
         turn: rad, error of the root's attitude that costs 1.
@@ -264,7 +265,7 @@ def best_steps(
 
 
 #: Worlds that compute differences, and rows of which a linear model is kept at once (35 kB each).
-WORLDS, ROWS = 4096, 4000
+WORLDS, ROWS = 1024, 4000
 #: Damping never leaves these.
 DAMPING = (1e-3, 30.0)
 
@@ -323,10 +324,8 @@ class TrajectoryOptimizer:
     def iterate(self) -> TrajOptStats:
         """One iteration over all clips."""
         begun = time.perf_counter()
-        worlds = self._worlds()
         for clips in self._parts():
-            self._improve(clips, worlds)
-        worlds.close()
+            self._improve(clips)
         self.iteration += 1
         self.seconds += time.perf_counter() - begun
         off = (self.qpos[:, :3] - self.reference.qpos[:, :3]).norm(dim=1).mean()
@@ -338,12 +337,10 @@ class TrajectoryOptimizer:
         """The trajectories as they are now, with feedback that uses no wrench."""
         frames, n = self.reference.frames, 2 * self.model.nv
         feedback = torch.zeros(frames, self.joints, n)
-        worlds = self._worlds()
         for clips in self._parts():
             rows = self._rows(clips)
-            gains = self._regulate(rows, self.lengths[clips], worlds, self.config.sizes[1], helped=False)
+            gains = self._regulate(rows, self.lengths[clips], self.config.sizes[1], helped=False)
             feedback[rows] = torch.from_numpy(gains.feedback)
-        worlds.close()
         target, price = self.action[:, : self.joints].float(), torch.from_numpy(self.price).float()
         return Trajectories(self.qpos, self.qvel, target, self._blurred(feedback), price)
 
@@ -379,8 +376,11 @@ class TrajectoryOptimizer:
 
     # --- one iteration ------------------------------------------------------------------------
 
+    @cached_property
     def _worlds(self) -> CpuBackend:
-        return CpuBackend(self.model, min(WORLDS, 600 * len(self.qpos)), self.threads)
+        """Compute differences; their number is that of a few frames, or of all that there are."""
+        each = 2 * (2 * self.model.nv + self.action.shape[1]) + 1
+        return CpuBackend(self.model, max(each, min(WORLDS, each * len(self.qpos))), self.threads)
 
     def _parts(self) -> list[list[int]]:
         """Clips, some at a time, so that their linear models fit into memory."""
@@ -395,15 +395,13 @@ class TrajectoryOptimizer:
         spans = [np.arange(self.starts[c], self.starts[c] + self.lengths[c]) for c in clips]
         return torch.from_numpy(np.concatenate(spans))
 
-    def _regulate(
-        self, rows: Tensor, lengths: np.ndarray, worlds: CpuBackend, size: float, helped: bool
-    ) -> Regulator:
+    def _regulate(self, rows: Tensor, lengths: np.ndarray, size: float, helped: bool) -> Regulator:
         """The regulator of the clips that have these rows."""
         own = rows.numpy()
         moving = torch.from_numpy(np.flatnonzero(~self.last[own]))
         r = rows[moving]
         how = (self.unit, self.sim.substeps, size)
-        linear = linearise(worlds, self.qpos[r], self.qvel[r], self.action[r], *how)
+        linear = linearise(self._worlds, self.qpos[r], self.qvel[r], self.action[r], *how)
         n, m = 2 * self.model.nv, self.action.shape[1] if helped else self.joints
         a, b = np.zeros((len(own), n, n), np.float32), np.zeros((len(own), n, m), np.float32)
         a[moving], b[moving] = linear.a, linear.b[:, :, :m]
@@ -418,9 +416,9 @@ class TrajectoryOptimizer:
         damping = self.damping[own] if helped else None
         return regulate(a, b, gap, error, effort, self.price, price, lengths, damping)
 
-    def _improve(self, clips: list[int], worlds: CpuBackend) -> None:
+    def _improve(self, clips: list[int]) -> None:
         c, rows, lengths = self.config, self._rows(clips), self.lengths[clips]
-        gains = self._regulate(rows, lengths, worlds, c.size(self.iteration), helped=True)
+        gains = self._regulate(rows, lengths, c.size(self.iteration), helped=True)
         # Borders are elsewhere every other time, so that what jumps there can close.
         size = round(c.segment_s * self.sim.control_hz)
         cut = segments(lengths, size, size // 2 if self.iteration % 2 else 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from poise.plan.lqr import Regulator, regulate
+from poise.papers.perpetual.lqr import Regulator, regulate
 from refusals import refused
 
 N, M = 4, 2

@@ -7,9 +7,16 @@ import math
 import pytest
 import torch
 
-from poise.learn.rtn import PLU, RTN, Critic, RTNConfig, arrival_embedding, noise_scale
 from poise.learn.transition import SkeletonLayout
 from poise.motion.rotations import quat_rotate
+from poise.papers.skeleton2humanoid.rtn import (
+    PLU,
+    RTN,
+    Critic,
+    RTNConfig,
+    arrival_embedding,
+    noise_scale,
+)
 from toy_windows import SMALL_RTN, bank, known, layout, moved
 
 

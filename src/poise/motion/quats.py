@@ -1,6 +1,6 @@
 """Rotations of one frame in numpy, wxyz: small arrays, for which torch takes most of a control step.
 
-The functions are those of `poise.spatial`, by which the tests check them.
+The functions are those of `poise.motion.rotations`, by which the tests check them.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray | float) -> np.ndarray
     """From a to b the short way; shares beyond 1 go on turning."""
     dot = (a * b).sum(-1, keepdims=True)
     b = np.where(dot < 0, -b, b)
-    half = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+    # |a - b| = 2 sin(half / 2) and |a + b| = 2 cos(half / 2): small angles keep all their digits.
+    half = 2.0 * np.arctan2(*(np.sqrt((x * x).sum(-1, keepdims=True)) for x in (a - b, a + b)))
     share = np.asarray(share, dtype=float)[..., None] if np.ndim(share) else share
     small = half < 1e-6
     sine = np.where(small, 1.0, np.sin(half))

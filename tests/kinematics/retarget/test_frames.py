@@ -9,11 +9,11 @@ import torch
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.kinematics import clip_to_qpos
-from poise.kinematics.retarget.passage import Retargeter
+from poise.kinematics.coords import Hinges
+from poise.kinematics.retarget.passage import Retargeter, local_of, world_of
 from poise.kinematics.retarget.standing import ClipWorld
-from poise.live import quats as q
-from poise.live.passage import FramePassage, Hinges, local_of, world_of
 from poise.motion import Clip
+from poise.motion import quats as q
 from poise.motion.rotations import quat_mul, quat_rotate, quat_to_matrix, slerp
 from test_docs import WALK
 
@@ -38,12 +38,12 @@ def test_rotations_are_those_of_spatial() -> None:
 
 def test_a_frame_passes_as_the_clip_does(walk: Clip) -> None:
     tracker = open_run(None).tracker
-    one = FramePassage(walk, tracker.example)
-    rot, root = Retargeter.between(walk, tracker.example).transfer(ClipWorld.of(walk))
+    one = Retargeter.between(walk, tracker.example)
+    rot, root = one.transfer(ClipWorld.of(walk))
     hinges, last = Hinges(tracker.example.skeleton, tracker.humanoid.table), None
     made = []
     for t in range(walk.frames):
-        there, world = one(walk.root_pos[t], walk.rot[t])
+        there, world = one(walk.root_pos[t], world_of(walk.skeleton, walk.rot[t]))
         np.testing.assert_allclose(there, root[t], atol=1e-9)
         own = local_of(one.target, world)
         np.testing.assert_allclose(np.abs((own * rot[t].numpy()).sum(-1)), 1.0, atol=1e-9)

@@ -2,43 +2,26 @@
 
 from __future__ import annotations
 
-from collections import deque
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.live.characters import FALLS, RETURNS, EndlessCoords, tensor
-from poise.live.commands import LiveConfig
-from poise.live.people import Calibration, People, calibrated
-from poise.live.stream import Packet, margin
-from poise.live.vmc import Own
+from poise.live.people import Own, People, calibrated
+from poise.live.protocol import LiveConfig
+from poise.live.stream import margin
 from poise.live.world import LiveWorld
-from poise.motion import Clip
 from poise.synthesis.generator import Kinematic
 
 #: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
 #: nothing is caught up with.
 CATCHES_UP, GIVES_UP_S = 0.15, 1.5
-#: Steps of which it is kept what was read; goals are fewer behind.
-READ = 16
 #: s in which errors wander.
 WANDERS_S = 0.3
-
-
-class Next(NamedTuple):
-    """What characters are to do.
-
-    Attributes:
-        frames: `(K, 7 + n)`, the newest that the goals know.
-        places: `(K, B, 3)` m of the bodies, NaN where the frames tell them; None where they all do.
-    """
-
-    frames: Tensor
-    places: Tensor | None
 
 
 class Targets:
@@ -63,29 +46,36 @@ class Targets:
     ):
         self.world, self.noise, self.generator = world, config.noise, generator
         self._executor = executor
-        self.people = People(config.characters, config.buffer_s, self._calibration, executor)
-        for k, character in enumerate(world.characters):
-            character.on_move(lambda seen, to, k=k: self._moved(k, seen, to))
+        t = world.tracker
+        ease = t.recovery_clips.ease.numpy() if t.recovery_clips is not None else np.zeros(0)
+        body = {"humanoid": t.humanoid, "example": t.example, "ease": ease, "how": t.onto}
+        calibrate = partial(calibrated, **body)
+        self.people = People(config.characters, config.buffer_s, calibrate, executor)
         self.endless = dict[int, EndlessCoords]()
         self.read_s: float | None = None
         self._errors = dict[int, np.ndarray]()
-        # What was read of each character's person in the last steps; None where the goal is another.
-        self._own = [deque[Own | None](maxlen=READ) for _ in range(config.characters)]
         self._was = list[object]([None] * config.characters)
         self.rng = np.random.default_rng(config.seed)
         self.set_lead()
 
-    def next(self, now_s: float) -> Next:
-        """What is to be done in the control step at `now_s`."""
+    def next(self, now_s: float) -> tuple[Tensor, Tensor | None, tuple[Own | None, ...]]:
+        """What characters are to do in the control step at `now_s`.
+
+        Returns:
+            frames: `(K, 7 + n)`, the newest that the goals know.
+            places: `(K, B, 3)` m of the bodies, NaN where the frames tell them; None where they all do.
+            own: the people's poses that the frames are.
+        """
         reads = self._reads(now_s)
-        frames, places = zip(*(self._frame(k, reads) for k in range(self.world.count)), strict=True)
+        every = (self._frame(k, reads) for k in range(self.world.count))
+        frames, places, own = zip(*every, strict=True)
         if all(p is None for p in places):
-            return Next(torch.stack(frames), None)
+            return torch.stack(frames), None, own
         out = torch.full((self.world.count, len(self.world.humanoid.bodies), 3), torch.nan)
         for k, told in enumerate(places):
             if told is not None:
                 out[k] = torch.from_numpy(told)
-        return Next(torch.stack(frames), out)
+        return torch.stack(frames), out, own
 
     def _reads(self, now_s: float) -> float:
         """When people are read: a step later than the last time, whenever the step comes, so that a slow
@@ -99,8 +89,9 @@ class Targets:
         self.read_s = read
         return read
 
-    def _frame(self, k: int, now_s: float) -> tuple[Tensor, np.ndarray | None]:
-        """The newest frame that character k's goal knows, and where its bodies are, if that is told."""
+    def _frame(self, k: int, now_s: float) -> tuple[Tensor, np.ndarray | None, Own | None]:
+        """The newest frame that character k's goal knows, where its bodies are, if that is told, and the
+        person's pose that it is."""
         world, person = self.world, self.people.of(k)
         character, endless = world.characters[k], self.endless.get(k)
         qpos, own, places, stalled = None, None, None, False
@@ -124,14 +115,14 @@ class Targets:
                 qpos, where = tensor(made), replace(onto.where)
                 own = Own(onto.passage.source, pose.root_pos, pose.rot, where, onto.scale)
         frame = character.next(qpos, world.body(k), stalled)
-        follows_it = frame is qpos
-        self._own[k].append(own if follows_it else None)
-        return frame, places if follows_it else None
-
-    def own(self, k: int) -> Own | None:
-        """The person's pose that character k's goal is now; None where it follows something else."""
-        read, back = self._own[k], self.world.lead[k]
-        return read[-back] if len(read) >= back else None
+        if character.moved is not None:
+            # Its motion goes on from elsewhere.
+            seen, to = (x.numpy() for x in character.moved)
+            if endless is not None:
+                endless.move(seen, to)
+            elif person is not None and person.onto is not None:
+                person.onto.where.move(seen, to)
+        return (frame, places, own) if frame is qpos else (frame, None, None)
 
     def _noisy(
         self, k: int, qpos: np.ndarray, places: np.ndarray | None = None
@@ -152,18 +143,6 @@ class Targets:
             if places is not None:
                 places = places + 0.03 * size * wander[n:].reshape(places.shape)
         return qpos, places
-
-    def _calibration(self, packet: Packet, clip: Clip) -> Calibration | str:
-        t = self.world.tracker
-        ease = t.recovery_clips.ease.numpy() if t.recovery_clips is not None else np.zeros(0)
-        return calibrated(packet, clip, t.humanoid, t.example, ease, t.onto)
-
-    def _moved(self, k: int, seen: Tensor, to: Tensor) -> None:
-        person = self.people.of(k)
-        if k in self.endless:
-            self.endless[k].move(seen.numpy(), to.numpy())
-        elif person is not None and person.onto is not None:
-            person.onto.move(seen.numpy(), to.numpy())
 
     def set_lead(self) -> None:
         """How many frames goals are behind what is read, by the length of the buffer."""

@@ -8,15 +8,17 @@ import pytest
 import torch
 
 from poise.jobs.perpetual.run import begin, train
-from poise.jobs.perpetual.stage_start import PATHS
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
-from poise.plan import TrajOptConfig, TrajOptStats
+from poise.motion import ClipLibrary
+from poise.papers.perpetual.primitive_stages import PATHS
+from poise.papers.perpetual.trajopt import TrajOptConfig, TrajOptStats
 from poise.recipes.perpetual_settings import config_of
 from poise.recipes.shapes import BodyShapes
 from poise.settings import to_data
 from refusals import refused
-from toy_library import library, tiny
+from toy_human import swing
+from toy_library import tiny
 
 PATH = TrajOptConfig(iterations=2, segment_s=0.3)
 
@@ -32,7 +34,8 @@ def run(folder: Path, stop_after: int = 0) -> list[TrajOptStats]:
             raise KeyboardInterrupt
 
     config = tiny(trajopt=PATH, help_start=0.0, style=None)
-    imitation = begin(folder, library(), config)
+    clips = ClipLibrary.of([swing(0.3, name="calm"), swing(0.4, speed=1.0, name="walk")])
+    imitation = begin(folder, clips, config)
     train(
         imitation,
         folder,

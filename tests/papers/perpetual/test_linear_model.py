@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
-from poise.plan.lqr import driven, linearise
+from poise.papers.perpetual.lqr import driven, linearise
 from poise.sim import CpuBackend, alone, difference, displaced
 from toy_human import human
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
+from poise.kinematics.feet import Motion, standing_heights
 from poise.kinematics.repair.doctor import examine
+from poise.kinematics.steps import planned, stepped
 from poise.motion import Clip
 from poise.motion.rotations import forward_kinematics
-from poise.synthesis.footsteps import stepped
-from poise.synthesis.limits import Motion, excess, fastest, standing_heights
-from poise.synthesis.steps import planned
+from poise.synthesis.limits import excess, fastest
 from toy_human import swing
 
 FPS = 30.0

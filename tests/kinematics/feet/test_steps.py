@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from poise.kinematics.steps import CLEAR_M, LEAST_M, lock_feet, missing_steps, rises
 from poise.motion.rotations import forward_kinematics
 from poise.motion.windows import foot_joints
-from poise.synthesis.footsteps import lock_feet
-from poise.synthesis.steps import CLEAR_M, LEAST_M, missing_steps, rises
 from toy_human import swing, turn
 
 FPS = 30.0
