@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 MINUTES ?= 1.2
-# Where the CMU clips of the benchmark lie, as benchmarks/first_light.py describes them.
+# What is measured, and where the development set lies.
+SUITE ?= engine
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
 
 .DEFAULT_GOAL := help
@@ -17,7 +18,7 @@ help:
 	@echo "make test-all run every test: also of trainings, processes, browsers, docs and benchmarks"
 	@echo "make check   lint, formatting, types, order of imports"
 	@echo "make format  mend formatting and simple lint"
-	@echo "make bench   measure a walk and a cartwheel again on the CMU clips in DATA=FOLDER"
+	@echo "make bench   measure what is missing of SUITE=engine (all: every suite) with the clips in DATA=FOLDER"
 	@echo "make docs    fill the documents from results/ and the code, check them, build their site into site/"
 	@echo "make clean   remove $(VENV), demo/ and caches"
 
@@ -67,7 +68,7 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 
 bench: $(VENV)/.dev
-	$(BIN)/python benchmarks/first_light.py --data '$(DATA)'
+	$(BIN)/python -m benchmarks $(SUITE) --data '$(DATA)'
 
 # Tables and generated pages are filled from results/ and the code. The site is built where its packages can
 # be installed, in an environment of its own; without network it is left out, which is no failure.
@@ -87,4 +88,4 @@ docs: $(VENV)/.installed
 clean:
 	rm -rf $(VENV) demo site build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	rm -rf src/*.egg-info MUJOCO_LOG.TXT
-	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+	find src tests benchmarks training docs -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

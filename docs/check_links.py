@@ -14,7 +14,7 @@ _HEADING = re.compile(r"^#+ +(.+?) *$", re.MULTILINE)
 
 def pages() -> list[Path]:
     """The markdown files of the repository, but for tables that scripts of the benchmarks write."""
-    folders = ("docs", "benchmarks/notes", "benchmarks/tracker", "integrations", "src")
+    folders = ("docs", "benchmarks/notes", "training", "integrations", "src")
     return sorted(
         [
             *ROOT.glob("*.md"),

@@ -10,12 +10,18 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from engine import main
-from speed import bench_engine, bench_gpu, bench_latency, bench_physics, bench_scaling, machine
-from speed.engine import Raw, exploring, record
-from speed.machine import Clock
-from speed.stable_pd import StablePDBackend
 
+from benchmarks.common.machine import Clock, machine
+from benchmarks.suites.engine import (
+    Raw,
+    StablePDBackend,
+    bench_engine,
+    bench_latency,
+    bench_physics,
+    exploring,
+    record,
+)
+from benchmarks.suites.gpu import bench_gpu
 from poise.jobs.runs import begin, train
 from poise.learn import PPOConfig, Until
 from poise.motion import ClipLibrary
@@ -68,12 +74,6 @@ def test_gpu_measures_against_mujoco_warps_own_step(imitation):
     for name in ("raw", "stepping", "training"):
         assert result[f"{name}_per_s"] > 0
     json.dumps(result, allow_nan=False)
-
-
-def test_scaling_has_a_row_for_every_number(imitation):
-    rows = bench_scaling(imitation, worlds=(2, 4), threads=(1, 2), samples=16, repeats=1)
-    assert [(r["envs"], r["threads"]) for r in rows] == [(2, 1), (4, 1), (2, 2), (4, 2)]
-    assert all(r["stepping_per_s"] > 0 and r["raw_per_s"] > 0 for r in rows)
 
 
 def test_latency_counts_policy_physics_and_the_rest(imitation):
@@ -133,40 +133,3 @@ def test_physics_scores_one_policy_on_every_kind(tmp_path: Path):
 def test_the_machine_is_stated():
     facts = machine()
     assert facts["cores"] >= 1 and {"torch", "mujoco", "poise", "load_before"} <= facts.keys()
-
-
-def test_the_command_prints_tables_and_saves_json(tmp_path, capsys):
-    path = tmp_path / "engine.json"
-    assert main(["engine", "--envs", "8", "--repeats", "1", "--json", str(path)]) == 0
-    said = capsys.readouterr().out
-    assert "stepping: observations, rewards, resets" in said and "update" in said
-    saved = json.loads(path.read_text())
-    assert (
-        saved["command"].startswith("benchmarks/engine.py engine --envs 8")
-        and saved["engine"]["envs"] == 8
-    )
-
-
-@pytest.mark.parametrize(
-    ("argv", "words"),
-    [
-        (["physics"], "physics needs the folder of a run"),
-        (["engine", "somewhere"], "only physics takes a run"),
-        (["engine", "--repeats", "0"], "--repeats must be at least 1, got 0"),
-    ],
-)
-def test_mistakes_are_told(argv, words, capsys):
-    assert main(argv) == 2
-    assert words in capsys.readouterr().err
-
-
-def test_figures_are_set_beside_earlier_ones(tmp_path, capsys):
-    before = tmp_path / "before.json"
-    before.write_text(json.dumps({"latency": {"ms": 1e6}}))
-    main(["latency", "--against", str(before)])
-    out = capsys.readouterr().out
-    assert "compared with before" in out and "-100 %" in out
-    for text, said in (("{}", "holds no figures of this benchmark"), ("", "cannot be compared with")):
-        before.write_text(text)
-        assert main(["latency", "--against", str(before)]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())

@@ -1,13 +1,14 @@
-"""What `benchmarks/endless_tables.py` holds out, how far off futures are, what acts on a policy."""
+"""What the tables of predictions holds out, how far off futures are, what acts on a policy."""
 
 from __future__ import annotations
 
-import endless_data as data
-import endless_methods as methods
-import endless_tables as tables
 import pytest
 import torch
-from next_frames import NextFrame
+
+from benchmarks.suites import papers_prediction as data
+from benchmarks.suites.papers_next_frames import NextFrame
+
+methods = tables = data
 
 CMU = data.LIBRARIES["CMU"]
 

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from next_frames import NextFrame, NextFrameConfig, NextFrameObjective, NextFrames
 
+from benchmarks.suites.papers_next_frames import (
+    NextFrame,
+    NextFrameConfig,
+    NextFrameObjective,
+    NextFrames,
+)
 from poise.learn.cvae import PackedFrames
 from poise.learn.inbetween_model import InbetweenTrainer
 from poise.synthesis.generator import ROOT

@@ -9,9 +9,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from speed.stance import Stance, polygon_margin, relaxed_stance, sole_corners, support_polygon
-from speed.standing import measure, scaled, stand
 
+from benchmarks.common.stance import (
+    Stance,
+    polygon_margin,
+    relaxed_stance,
+    sole_corners,
+    support_polygon,
+)
+from benchmarks.suites.retarget_repair import measure, scaled, stand
 from poise.body import Humanoid, generate_table, make_humanoid
 from poise.formats import read_clip
 from poise.kinematics import Kinematics, fit_humanoid, lowest_height

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from speed.stance import relaxed_stance
 
+from benchmarks.common.stance import relaxed_stance
 from poise.body import BodyConfig, make_humanoid, read_mjcf
 from poise.kinematics import Kinematics, fit_humanoid
 from poise.recipes.residual_force import ResidualForce, build

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support_motions import motion
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
@@ -17,6 +16,7 @@ from poise.jobs.track.supports import at_home, on_body
 from poise.jobs.tracker import Tracker
 from poise.kinematics.supports import Support, read_supports
 from refusals import refused
+from support_motions import motion
 from toy_policy import walk
 
 

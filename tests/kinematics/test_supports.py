@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support_motions import motion
 
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
@@ -19,6 +18,7 @@ from poise.kinematics.forward import poses_of
 from poise.kinematics.supports import Support, face, read_supports, rectangle
 from poise.motion import Clip
 from refusals import refused
+from support_motions import motion
 from toy_policy import walk
 
 

@@ -305,5 +305,5 @@ def build(
     return shaped(built, config.shapes, lambda body: task(config, body, guided))
 
 
-#: Expected figures: see `benchmarks/perpetual.md`.
+#: Expected figures: see `results/track.csv`.
 RECIPE: dict[str, Any] = {"name": "perpetual", "config": Perpetual, "build": build, "expected": {}}

@@ -155,7 +155,7 @@ def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
 
 
-#: What to expect of the default settings (see `benchmarks/first_light.json`).
+#: What to expect of the default settings (see `results/imitate.csv`, from nothing).
 RECIPE: dict[str, Any] = {
     "name": "residual-force",
     "config": ResidualForce,

@@ -353,5 +353,5 @@ def validation(task: Task, lengths: tuple[int, ...] = (5, 15, 30)) -> Callable[.
     return check
 
 
-#: Expected figures: see `benchmarks/inbetween.md`, which `benchmarks/inbetween.py` writes.
+#: Expected figures: see `results/inbetween-complete.csv`.
 RECIPE: dict[str, Any] = {"name": "inbetween", "config": Inbetween, "build": prepare, "expected": {}}

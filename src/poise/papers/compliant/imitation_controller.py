@@ -198,5 +198,5 @@ def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Compl
     return from_data(CompliantImitation, Migration()(data), where)
 
 
-#: See `benchmarks/compliant_imitation.json`.
+#: See `results/papers.csv`.
 RECIPE: dict[str, Any] = {"name": "compliant-imitation", "config": CompliantImitation, "build": build}

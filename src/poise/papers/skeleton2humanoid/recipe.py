@@ -109,7 +109,7 @@ def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
     return imitation_of(clips, config or settings())
 
 
-#: See `benchmarks/skeleton_to_humanoid.json`.
+#: See `results/papers.csv`.
 RECIPE: dict[str, Any] = {
     "name": "skeleton-to-humanoid",
     "config": ResidualForce,

@@ -1,0 +1,1 @@
+"""The suites, a module each: `PARTS` are what the runner measures."""

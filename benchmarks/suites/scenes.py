@@ -1,0 +1,365 @@
+"""Scenes with forces: how stiff hands are against what is commanded, throws by level, doors, balls,
+fights.
+
+All by the policy that ships, alone and without help. Each scene stands beside its twin that does not
+give way ("without", the law off), and fights beside the player whom nobody touches: these are the nulls.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+
+from benchmarks.common.clips import WALK, Places
+from benchmarks.common.rows import Figure, of, short
+from benchmarks.common.runner import Part, Raws
+from poise.control import Compliance, Stiffness
+from poise.env.pushes import Pushes
+from poise.formats import read_clip
+from poise.jobs.open import open_run
+from poise.jobs.tracker import Tracker
+from poise.papers.compliant.figures import measure, slope, throws
+from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
+from poise.papers.compliant.play import play
+from poise.papers.compliant.scenes import (
+    Balance,
+    Chicken,
+    DoorScene,
+    HandInHand,
+    PlayScene,
+    Throws,
+    TrampolineScene,
+)
+from poise.papers.compliant.training import shipped
+from poise.papers.compliant.watch import PUSHED_S
+from poise.sim import SimConfig
+
+COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
+
+
+LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
+
+
+#: Characters, control steps and repetitions of the cost.
+ROWS, STEPS, REPEATS = 512, 12, 9
+
+
+def cost(tracker: Tracker, many: int, steps: int, repeats: int) -> dict[str, Any]:
+    """Control steps of environments with a force in every world, with compliance against without: the
+    processor's time, of steps that take turns, so that what else the machine does counts little."""
+    task = standing(tracker, 5.0)
+    push = Pushes((20.0, 20.0), (0.03, 0.03), 100.0, task.humanoid.rows_of("hand"))
+    envs = {}
+    for name, given in (("without", None), ("eq8", Compliance()), ("stiffness", Stiffness())):
+        own = replace(task.task, plugins=(push,), compliance=given, dones=(), help_by="all")
+        envs[name] = replace(task, task=own).env(
+            many, auto_reset=False, threads=1, help_scale=0.0, guard=False
+        )
+    zero, spent = torch.zeros(many, dtype=torch.long), {name: list[float]() for name in envs}
+    still = torch.zeros(many, envs["without"].num_actions)
+    for repeat in range(repeats + 1):
+        for env in envs.values():
+            env.reset_to(zero, zero)
+        for step in range(steps + 2):
+            for name, env in envs.items():
+                begun = time.process_time()
+                env.step(still)
+                # The first ones record, and nothing pushes yet.
+                if repeat and step >= 2:
+                    spent[name].append(time.process_time() - begun)
+    middle = {name: statistics.median(values) for name, values in spent.items()}
+    out: dict[str, Any] = {
+        "rows": many,
+        "steps": len(spent["without"]),
+        "goals": len(task.task.window) + 2,
+    }
+    out["ms_a_step"] = {k: round(1000 * v, 2) for k, v in middle.items()}
+    shares = {
+        k: [a / b for a, b in zip(spent["without"], v, strict=True)]
+        for k, v in spent.items() if k != "without"
+    }  # fmt: skip
+    out["share_of_without"] = {k: round(statistics.median(v), 3) for k, v in shares.items()}
+    out["share_quartiles"] = {
+        k: [round(float(np.quantile(v, q)), 3) for q in (0.25, 0.75)] for k, v in shares.items()
+    }
+    return out
+
+
+def at_rate(tracker: Tracker, rate_hz: float) -> Tracker:
+    """The same policy with other physics steps."""
+    sim = SimConfig(rate_hz=rate_hz, control_hz=tracker.config.sim.control_hz)
+    return replace(tracker, config=replace(tracker.config, sim=sim))
+
+
+Given = Compliance | Stiffness | None
+LAG = "stiffness 500, lag 0.5 s"
+#: What gives way, by its name.
+WAY: dict[str, Given] = {
+    "without": None,
+    "level 0.04": Compliance(0.04),
+    "level 0.16": Compliance(0.16),
+    "level 0.2": Compliance(0.2),
+    LAG: Stiffness(500.0, 0.5),
+    "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
+}
+
+
+@cache
+def policy() -> Tracker:
+    """The policy that ships."""
+    return open_run(None).tracker
+
+
+# --- stiffness ------------------------------------------------------------------------------------
+
+
+def stiff_units(places: Places) -> list[str]:
+    """What is commanded, and how."""
+    if places.smoke:
+        return ["law off", "commanded 160 N/m"]
+    return ["law off", *(f"commanded {k:g} N/m" for k in COMMANDS), *(f"level {a:g}" for a in LEVELS)]
+
+
+def stiff(places: Places, unit: str) -> Any:
+    """At both hands and in six directions, of a character that stands."""
+    how, _, number = unit.partition(" ")
+    if how == "commanded":
+        made = measure(policy(), Stiffness(), (float(number.split()[0]),), threads=1)
+    else:
+        given = None if how == "law" else Compliance()
+        made = measure(
+            policy(),
+            given,
+            *(() if given is None else ((float(number),),)),
+            newtons=lambda _: 10.0,
+            threads=1,
+        )
+    values = [m.stiffness for m in made if math.isfinite(m.stiffness)]
+    return {"values": values, "fell": sum(m.fell for m in made)}
+
+
+def stiff_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Medians, and how well what is commanded and what is measured go in the same order."""
+    pairs = []
+    for unit, raw in raws.items():
+        values = raw["values"]
+        spread = " to ".join(short(float(np.quantile(values, q))) for q in (0.1, 0.9))
+        subject = f"standing, hands, {unit}"
+        yield Figure(subject, "stiffness_n_per_m", statistics.median(values), len(values), spread)
+        yield Figure(subject, "fell", raw["fell"], len(values))
+        if unit.startswith("commanded"):
+            pairs += [(float(unit.split()[1]), v) for v in values]
+    rank = (
+        float(spearmanr(*zip(*pairs, strict=True)).statistic)
+        if len({k for k, _ in pairs}) > 1
+        else math.nan
+    )
+    yield from of("standing, hands, all commands", {"rank_correlation": rank}, len(pairs))
+
+
+# --- throws ---------------------------------------------------------------------------------------
+
+SOFT = (4000.0, 1000.0, 400.0, 200.0, 100.0, 50.0)
+THROWS = {
+    "eq8, 60 Hz": 200,
+    "algorithm1, 60 Hz": 40,
+    "eq8, 600 Hz": 200,
+    "algorithm1, 600 Hz": 40,
+    "stiffness, 60 Hz": 200,
+}
+
+
+def throw_units(places: Places) -> list[str]:
+    """Laws and rates."""
+    return list(THROWS)[: 1 if places.smoke else None]
+
+
+def thrown(places: Places, unit: str) -> Any:
+    """The same throws at each level; the first is the null."""
+    law, _, rate = unit.removesuffix(" Hz").partition(", ")
+    given: Any = Stiffness() if law == "stiffness" else Compliance(law=law)  # type: ignore[arg-type]
+    levels = SOFT if law == "stiffness" else LEVELS
+    count = THROWS[unit]
+    if places.smoke:
+        count, levels = 2, levels[::5]
+    found = throws(policy(), given, levels, count, float(rate), threads=1)
+    out: dict[str, Any] = {"levels": list(levels), "fell": found.fell.sum(1).tolist(), "throws": count}
+    out["goal_moved_mm"] = (1000 * np.nanmean(found.moved, 1)).tolist()
+    for name in ("impulse", "peak", "torque"):
+        values = getattr(found, name)
+        out[f"{name}_ratio"] = np.nanmean(values / values[:1], 1).tolist()
+        if law != "stiffness" and not places.smoke:
+            out[f"{name}_slope"] = list(slope(levels, values))
+    return out
+
+
+def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Ratios to the first level; the slope over levels with its interval of 95 %."""
+    for unit, raw in raws.items():
+        words = "{:g} N/m" if unit.startswith("stiffness") else "level {:g}"
+        for k, level in enumerate(raw["levels"]):
+            names = ("impulse_ratio", "peak_ratio", "torque_ratio", "fell", "goal_moved_mm")
+            values = {n: raw[n][k] for n in names}
+            yield from of(f"throws, {unit}, {words.format(level)}", values, raw["throws"])
+        for name in ("impulse", "peak", "torque"):
+            if f"{name}_slope" in raw:
+                middle, low, high = raw[f"{name}_slope"]
+                yield Figure(f"throws, {unit}, all levels", f"{name}_slope", middle, raw["throws"],
+                             f"{short(low)} to {short(high)}")  # fmt: skip
+
+
+# --- scenes ---------------------------------------------------------------------------------------
+
+Case = tuple[PlayScene, tuple[str, ...], float, int]
+CHICKEN = {
+    "chicken, heavy and light": (Chicken(against="rival"), ("level 0.16", LAG)),
+    "chicken, heavy and light, 600 Hz": (Chicken(against="rival"), ("level 0.16",)),
+    "chicken, 60 kg each": (Chicken(60.0, 60.0, against="rival"), ("level 0.16",)),
+    "chicken, heavy against a bag of 36 kg": (Chicken(85.0, 36.0), ("level 0.16",)),
+    "chicken, light against a bag of 85 kg": (Chicken(36.0, 85.0), ("level 0.16",)),
+}
+BALL: dict[str, dict[str, Any]] = {
+    "ball": {},
+    "ball, pushed with 50 N": {"pushes": 50.0},
+    "ball, pushed with 100 N": {"pushes": 100.0},
+    "ball, pushed with 50 N, another seed": {"pushes": 50.0, "seed": 1},
+    "ball, rod of 0.9 m": {"length": 0.9},
+    "ball, rod of 1.1 m": {"length": 1.1},
+}
+DOORS = {
+    f"door {w:g} m{', motion for 1 m' if m else ''}": DoorScene(w, made_for=m)
+    if w > 1
+    else DoorScene(1.0)
+    for w, m in ((1.0, None), (1.35, None), (1.7, None), (1.35, 1.0), (1.7, 1.0))
+}
+#: Scenes, what gives way beside the twin that does not, s, episodes.
+SCENES: dict[str, Case] = {
+    "hand in hand, walking": (
+        HandInHand(),
+        ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
+        8.0,
+        16,
+    ),
+    "hand in hand, standing": (
+        HandInHand(),
+        ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
+        8.0,
+        16,
+    ),
+    **{k: (s, ("level 0.16", LAG, "stiffness 200, lag 0.5 s"), 0.0, 8) for k, s in DOORS.items()},
+    "trampoline": (TrampolineScene(), ("level 0.16", "level 0.04"), 8.0, 8),
+    **{k: (Balance(**v), ("linear law", "learned"), 20.0, 8) for k, v in BALL.items()},
+    **{k: (s, ways, 8.0, 8) for k, (s, ways) in CHICKEN.items()},
+}
+
+
+def scene_units(places: Places, begins: str) -> list[str]:
+    """The scenes whose names begin so."""
+    return [n for n in SCENES if n.startswith(begins)][: 1 if places.smoke else None]
+
+
+def played(places: Places, unit: str) -> Any:
+    """A scene by each way beside its twin."""
+    scene, ways, seconds, many = SCENES[unit]
+    if places.smoke:
+        ways, seconds, many = ways[:1], 1.0, 1
+    tracker = at_rate(policy(), 600.0) if "600 Hz" in unit else policy()
+    clip = read_clip(WALK) if unit.endswith("walking") else None
+    out: dict[str, Any] = {"episodes": many}
+    for way in ways:
+        own = shipped("ball", tracker) if way == "learned" else None
+        how = {} if not seconds else {"seconds": seconds}
+        made = play(scene, tracker, clip, WAY.get(way), many, threads=1, learned=own, **how)
+        out["without"], out[way] = dict(made.stiff), dict(made.figures)
+    if isinstance(scene, Chicken):
+        touch = next((i for i, arrows in enumerate(made.arrows) if len(arrows)), 0)
+        at = touch / made.evaluation.rollouts.fps
+        out["nobody touches"] = nobody(tracker, scene, at, many, seconds)
+    return out
+
+
+def scene_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Each way's figures."""
+    for unit, raw in raws.items():
+        for way, values in raw.items():
+            if way != "episodes":
+                yield from of(f"{unit}, {way}", values, raw["episodes"])
+
+
+def nobody(
+    tracker: Tracker, scene: Chicken, touch_s: float, many: int, seconds: float
+) -> dict[str, float]:
+    """How far the pelvis leaves its way in the same half second where nobody touches the player."""
+    clip = hopping(tracker, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
+    alone = play(Throws(every_s=(100.0, 100.0)), tracker, clip, None, many, seconds, 1)
+    rolled = alone.evaluation.rollouts
+    off = (rolled.pos - rolled.ref_pos)[:, :, 0, :2]
+    first = min(round(touch_s * rolled.fps), off.shape[1] - 2)
+    last = min(first + round(PUSHED_S * rolled.fps), off.shape[1] - 1)
+    return {
+        "pushed_mm": 1000.0 * float((off[:, last] - off[:, first]).norm(dim=-1).mean()),
+        "lost": alone.stiff["lost"],
+    }
+
+
+# --- cost -----------------------------------------------------------------------------------------
+
+
+def cost_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Shares of the environment without."""
+    raw = raws["cost"]
+    for name, share in raw["share_of_without"].items():
+        yield Figure(f"control steps with compliance, {name}", "share_of_without", share, raw["steps"],
+                     " to ".join(short(q) for q in raw["share_quartiles"][name]))  # fmt: skip
+
+
+def costs(places: Places, unit: str) -> Any:
+    """What compliance costs."""
+    return cost(policy(), *((8, 2, 1) if places.smoke else (ROWS, STEPS, REPEATS)))
+
+
+_SHIPS = ("tracker",)
+PARTS = {
+    "stiffness": Part(
+        "stiffness of hands, commanded and measured",
+        stiff_units,
+        stiff,
+        stiff_rows,
+        _SHIPS,
+        hours=0.3,
+        needs=(),
+    ),
+    "throws": Part(
+        "throws at a standing character", throw_units, thrown, throw_rows, _SHIPS, hours=1.5, needs=()
+    ),
+    **{
+        name: Part(
+            f"scenes: {name}",
+            partial(scene_units, begins=begins),
+            played,
+            scene_rows,
+            kinds,
+            hours=hours,
+            needs=(),
+        )
+        for name, begins, kinds, hours in (
+            ("hands", "hand in hand", _SHIPS, 0.3),
+            ("door", "door", _SHIPS, 0.5),
+            ("trampoline", "trampoline", _SHIPS, 0.1),
+            ("ball", "ball", ("tracker", "ball"), 0.5),
+            ("chicken", "chicken", _SHIPS, 0.5),
+        )
+    },
+    "cost": Part(
+        "what compliance costs", lambda _: ["cost"], costs, cost_rows, alone=True, hours=0.05, needs=()
+    ),
+}
