@@ -29,7 +29,8 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.figures import measure, slope, throws
 from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
-from poise.papers.compliant.play import play
+from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.scene_training import shipped
 from poise.papers.compliant.scenes import (
     Balance,
     Chicken,
@@ -39,7 +40,6 @@ from poise.papers.compliant.scenes import (
     Throws,
     TrampolineScene,
 )
-from poise.papers.compliant.training import shipped
 from poise.papers.compliant.watch import PUSHED_S
 from poise.sim import SimConfig
 
