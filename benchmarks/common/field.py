@@ -1,9 +1,9 @@
 """The field's tracking errors, as Perpetual Humanoid Control and UHC report them, episode by episode.
 
-Per frame and over all bodies, in mm at 30 Hz (see `metrics.tracking_errors`): g-MPJPE in the world, MPJPE
-after each root is subtracted, velocity (mm/frame) and acceleration (mm/frame^2). A failed episode counts up to
-and including the frame that broke PHC's rule; its first frame was set, not tracked, and does not count.
-The published code pools the frames of all clips, and so does `pooled`.
+Per frame and over all bodies, in mm at 30 Hz (see `metrics.tracking_errors`): g-MPJPE in the world,
+MPJPE after each root is subtracted, velocity (mm/frame) and acceleration (mm/frame^2). A failed episode
+counts up to and including the frame that broke PHC's rule; its first frame was set, not tracked, and
+does not count. The published code pools the frames of all clips, and so does `pooled`.
 """
 
 from __future__ import annotations

@@ -425,7 +425,7 @@ def _check_sizes(sizes: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
                 )
 
 
-N = TypeVar("N", bound=nn.Module)
+N = TypeVar("N", bound=TransitionNet)
 
 
 @dataclass(frozen=True)
@@ -506,7 +506,7 @@ def adapt(
             part = Known(*(x[low : low + config.batch] for x in known))
             own_count = len(part.target_root)
             with torch.enable_grad():
-                losses = test_loss(own, part, own.fill(part, length), config)  # type: ignore[arg-type]
+                losses = test_loss(own, part, own.fill(part, length), config)
                 (losses.sum() / (own_count if often else count)).backward()
             total += float(losses.detach().sum()) / count
             if often:

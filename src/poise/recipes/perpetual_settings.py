@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from poise.errors import PoiseError
 from poise.settings import (
@@ -251,7 +251,7 @@ class Perpetual:
             )
 
     @classmethod
-    def additive(cls, **changes: Any) -> Perpetual:
+    def additive(cls, **changes: Any) -> Self:
         """Settings for hours on a CPU: actions add to the reference's angles, with noise in radians
         that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
         stage has more evaluations before it counts as learned. Many worlds make large batches: what one
@@ -270,7 +270,7 @@ class Perpetual:
         }  # fmt: skip
         return cls(action="additive", **(own | changes))
 
-    def taught(self) -> Perpetual:
+    def taught(self) -> Self:
         """The same settings with a teacher that looks ahead. What is observed and done suits it: the
         heading of the hips, later frames, a filter of actions. Most time is the teacher's, and few
         worlds train the critic."""

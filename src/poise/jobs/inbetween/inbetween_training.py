@@ -34,6 +34,7 @@ from poise.learn.checkpoint import (
 from poise.learn.inbetween_model import (
     MODEL,
     BlockStats,
+    GapNetwork,
     InbetweenModel,
     InbetweenTrainer,
     Objective,
@@ -319,7 +320,7 @@ def train(
 
 def as_model(task: Task, trainer: InbetweenTrainer) -> InbetweenModel:
     """The averaged network with what is needed to use it."""
-    net, c = copy.deepcopy(trainer.averaged).eval(), task.config
+    net, c = cast("GapNetwork", copy.deepcopy(trainer.averaged).eval()), task.config
     meta: dict[str, Any] = {
         "name": c.name, "seed": c.seed, "step": trainer.step, "steps": trainer.steps,
         "seconds": round(trainer.seconds, 1), "clips": len(task.bank.clips),
