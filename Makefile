@@ -8,12 +8,13 @@ MINUTES ?= 1.2
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
 
 .DEFAULT_GOAL := help
-.PHONY: help install dev demo live test check format bench docs clean
+.PHONY: help install dev demo live test test-all check format bench docs clean
 
 help:
 	@echo "make demo    install into $(VENV), train on a walk for $(MINUTES) minutes, write demo/"
 	@echo "make live    install into $(VENV), show a character in the browser that can be pushed"
-	@echo "make test    run the tests"
+	@echo "make test    run the quick tests, in minutes"
+	@echo "make test-all run every test: also of trainings, processes, browsers, docs and benchmarks"
 	@echo "make check   lint, formatting, types, order of imports"
 	@echo "make format  mend formatting and simple lint"
 	@echo "make bench   measure a walk and a cartwheel again on the CMU clips in DATA=FOLDER"
@@ -48,8 +49,12 @@ live: $(VENV)/.installed
 	$(BIN)/poise live --open
 
 # Two at once: fixtures of a file are made once.
+PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(PYTEST) -m 'not (process or browser or learned or training or data or docs or benchmarks)'
+
+test-all: $(VENV)/.dev
+	$(PYTEST) $(if $(DURATIONS),--durations=$(DURATIONS))
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

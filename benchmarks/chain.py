@@ -24,7 +24,8 @@ import torch
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import Tracked, track, write
+from poise.jobs.result import Result
+from poise.jobs.track import track
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import mpjpe_global
@@ -83,7 +84,7 @@ def triple(name: str, data: Path, rng: np.random.Generator) -> tuple[list[Clip],
     return out, away
 
 
-def measured(tracked: Tracked, away: list[float], tracker: Tracker) -> dict[str, Any]:
+def measured(tracked: Result, away: list[float], tracker: Tracker) -> dict[str, Any]:
     """What became of a triple."""
     assert tracker.recovery_clips is not None
     qpos, r = tracked.evaluation.recordings[0].qpos, tracked.evaluation.rollouts
@@ -153,7 +154,7 @@ def main() -> None:
             spent = time.perf_counter() - begun
             found.setdefault(name, []).append(measured(tracked, away, tracker) | {"spent_s": spent})
             if args.save is not None:
-                write(tracked, args.save / f"{name}-{k}")
+                tracked.write(args.save / f"{name}-{k}")
             data = {"command": command, "machine": f"{platform.machine()}, 1 thread"}
             data |= {"tables": {n: table(t) for n, t in found.items()}, "triples": found}
             write_atomic(args.json, json.dumps(data, indent=1).encode())

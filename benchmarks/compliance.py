@@ -37,7 +37,8 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.figures import Measured, measure, slope, throws
 from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
-from poise.papers.compliant.play import play
+from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.scene_training import LearnedOnTop, digest_of, shipped
 from poise.papers.compliant.scenes import (
     Balance,
     Chicken,
@@ -47,7 +48,6 @@ from poise.papers.compliant.scenes import (
     Throws,
     TrampolineScene,
 )
-from poise.papers.compliant.training import LearnedOnTop, digest_of, shipped
 from poise.papers.compliant.watch import PUSHED_S
 from poise.plan import LookaheadConfig
 from poise.score.report import line_plot

@@ -30,7 +30,7 @@ from lookahead_sets import FILES, LIBRARIES, clips_of
 from poise import track
 from poise.errors import PoiseError
 from poise.formats import read_clip
-from poise.jobs.track import Tracked
+from poise.jobs.result import Result
 from poise.jobs.track.tracking import read_motion
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import jerk
@@ -116,7 +116,7 @@ def noisy(clip: Clip, kind: str, how: dict[str, Any]) -> dict[str, Any]:
     truth = torch.tensor(clip.positions()).float()
     if kind == "video":
         seen = perturb_clip(clip, VIDEO, 0)
-        done: Tracked = track(seen, **how)
+        done: Result = track(seen, **how)
         came = torch.tensor(seen.positions()).float()
     else:
         off = 0.01 / np.sqrt(3.0) * np.random.default_rng(0).standard_normal(truth.shape)

@@ -13,8 +13,8 @@ from torch import Tensor
 from tracker import SIXTY, TWINS
 
 from poise.body import BodyConfig
+from poise.jobs.endless.endless_training import reach_of
 from poise.jobs.endless.model import Motions, spread
-from poise.jobs.endless.training import reach_of
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import subject_of
 from poise.jobs.library.folder import library_of

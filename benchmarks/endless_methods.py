@@ -15,12 +15,12 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env import Acts, EnvStep, ImitationEnv, Reference
 from poise.env.generator import MotionGenerator
+from poise.jobs.endless.endless_training import codes_of
 from poise.jobs.endless.model import Motions
-from poise.jobs.endless.training import codes_of
 from poise.jobs.tracker import Tracker
 from poise.kinematics import qpos_velocity
 from poise.learn.cvae import CVAEConfig, CVAEObjective, CVAETraining, make_cvae
-from poise.learn.inbetween import InbetweenTrainer
+from poise.learn.inbetween_model import InbetweenTrainer
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task as universal_task

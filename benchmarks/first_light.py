@@ -18,8 +18,7 @@ from pathlib import Path
 import torch
 
 from poise.formats import read_clip
-from poise.jobs.deliver import deliver
-from poise.jobs.run_file import learning_curve
+from poise.jobs.result import Result
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.learn import Until
 from poise.motion import ClipLibrary
@@ -41,7 +40,7 @@ def imitate(data: Path, name: str, minutes: float, out: Path, seed: int) -> dict
     train(imitation, out / "run", Until(minutes=minutes))
     policy, meta = trained_policy(out / "run", imitation)
     evaluation = evaluate(imitation, policy, meta)
-    deliver(imitation, evaluation, out, learning_curve(out / "run"))
+    Result(imitation, evaluation, run=out / "run").write(out)
     card = evaluation.card.to_dict()
     for key in ("per_clip", "variants"):
         card.pop(key)

@@ -28,9 +28,9 @@ import torch
 from inbetween_baselines import Baseline
 
 from poise.errors import PoiseError
-from poise.jobs.inbetween.training import Inbetween, Task, begin, train
+from poise.jobs.inbetween.inbetween_training import Inbetween, Task, begin, train
 from poise.learn.between import BetweenConfig
-from poise.learn.inbetween import MODEL, Adaptation, BlockStats, InbetweenModel, adapt, load_model
+from poise.learn.inbetween_model import MODEL, Adaptation, BlockStats, InbetweenModel, adapt, load_model
 from poise.learn.transition import FilledGap, Known
 from poise.metrics import physics
 from poise.score.gaps import (

@@ -24,10 +24,17 @@ import torch
 from inbetween import choose_iterations, cost, known_of, some_of, truth_rows
 from inbetween_baselines import Baseline
 
-from poise.jobs.inbetween.training import Inbetween, Task, begin, train
+from poise.jobs.inbetween.inbetween_training import Inbetween, Task, begin, train
 from poise.jobs.library.clips import LibraryConfig
 from poise.learn.between import BetweenConfig, BetweenTraining
-from poise.learn.inbetween import Adaptation, BlockStats, InbetweenModel, adapt, load_model, save_model
+from poise.learn.inbetween_model import (
+    Adaptation,
+    BlockStats,
+    InbetweenModel,
+    adapt,
+    load_model,
+    save_model,
+)
 from poise.learn.transition import FilledGap
 from poise.score.gaps import GapRow, TestSet, evaluate, score, test_set
 

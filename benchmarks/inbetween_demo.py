@@ -21,7 +21,7 @@ import torch
 
 from poise.formats import read_clip
 from poise.jobs.inbetween.fill import shipped_model
-from poise.learn.inbetween import load_model
+from poise.learn.inbetween_model import load_model
 from poise.metrics.plausibility import foot_slide
 from poise.motion import Clip
 from poise.motion.rotations import quat_conj, quat_mul, quat_to_rotvec

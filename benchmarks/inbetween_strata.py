@@ -32,9 +32,9 @@ from inbetween_baselines import Baseline
 from inbetween_cmu import WAYS, config_of
 
 from poise.jobs.inbetween.fill import shipped_model
-from poise.jobs.inbetween.training import Task, begin
+from poise.jobs.inbetween.inbetween_training import Task, begin
 from poise.kinematics.feet import standing_labels
-from poise.learn.inbetween import InbetweenModel, adapt, load_model
+from poise.learn.inbetween_model import InbetweenModel, adapt, load_model
 from poise.learn.transition import FilledGap
 from poise.metrics import l2p
 from poise.motion import Clip, Skeleton

@@ -45,8 +45,8 @@ _CLOCKS = ("seconds", "crc32", "minutes", "begun")
 
 def miniature(folder: Path) -> None:
     """Clips and settings of trainings that take seconds."""
-    from poise.jobs.endless.training import Endless
-    from poise.jobs.inbetween.settings import Inbetween, small
+    from poise.jobs.endless.endless_training import Endless
+    from poise.jobs.inbetween.inbetween_settings import Inbetween, small
     from poise.learn.cvae import CVAEConfig
     from poise.settings import to_toml
 
@@ -65,16 +65,17 @@ def miniature(folder: Path) -> None:
 
 def tiny_perpetual() -> None:
     """The recipe with networks that are trained in no time, in this process alone."""
+    from poise.cli import train_perpetual
     from poise.learn import CloneConfig, PPOConfig
-    from poise.recipes import perpetual
-    from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
+    from poise.papers.perpetual.ablations import StagedPerpetual
+    from poise.recipes.perpetual_settings import RecoveryPlan
 
     ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
     own: dict[str, Any] = {
         "ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None,
         "recovering": RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2)),
     }  # fmt: skip
-    perpetual.Perpetual = lambda **given: Perpetual(**(own | given))  # type: ignore[assignment,misc]
+    train_perpetual.recipe = lambda additive: StagedPerpetual(**own)
 
 
 def command(recipe: str, here: Path, out: Path) -> list[str]:

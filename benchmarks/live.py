@@ -34,7 +34,7 @@ from speed import machine
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.live.characters import FALLS, RETURNS
-from poise.live.commands import LiveConfig
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live
 from poise.live.sources import Loop, packet_of
 from poise.motion import Clip

@@ -25,7 +25,7 @@ from poise.formats.point_fit import fit_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics.retarget.keypoint_goal import PointBody
-from poise.live.commands import LiveConfig
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live
 from poise.live.stream import Packet
 from poise.metrics import success_rule

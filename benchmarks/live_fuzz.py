@@ -23,8 +23,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from poise.errors import PoiseError
-from poise.live.commands import command, parse
 from poise.live.page.server import PageServer
+from poise.live.protocol import command, parse
 from poise.live.sockets import Guard, StreamDoor
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox
@@ -84,7 +84,7 @@ class Keep:
 def readers(box: Inbox, keep: Keep) -> dict[str, Callable[[bytes, int], bool]]:
     """What reads a message at each door; whether it was taken or refused is counted there."""
     vmc = VmcSource("127.0.0.1", 0, box, lambda: 0.0)
-    stream = JsonStream(box, "", keep)
+    stream = JsonStream(box, "", keep.offer)
     stream.receive(json.dumps(BODY), 0.0)
     stream.receive(json.dumps({k: v for k, v in POINTS.items() if k not in ("points",)}), 0.0)
 
@@ -132,8 +132,8 @@ def sockets(count: int, seed: int) -> dict[str, Any]:
     rng, box, keep, clock = np.random.default_rng(seed), Inbox(), Keep(), time.perf_counter
     guard = Guard("127.0.0.1", 0)
     hello, obeyed = {"characters": 1}, list[dict[str, Any]]()
-    server = PageServer(guard, hello, box, obeyed.append, lambda: {}, clock, keep)
-    vmc, door = VmcSource("127.0.0.1", 0, box, clock), StreamDoor("127.0.0.1", 0, box, keep, clock)
+    server = PageServer(guard, hello, box, obeyed.append, lambda: {}, clock, keep.offer)
+    vmc, door = VmcSource("127.0.0.1", 0, box, clock), StreamDoor("127.0.0.1", 0, box, keep.offer, clock)
     vmc.start()
     door.start()
     url, honest = f"ws://127.0.0.1:{guard.port}", {"sent": 0, "taken": 0}

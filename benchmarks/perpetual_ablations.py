@@ -30,16 +30,17 @@ from poise.cli.training import beginning
 from poise.jobs import runs
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import RESULT, begin, clips_of, resume, train
+from poise.jobs.perpetual.perpetual_run import RESULT, begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
 from poise.jobs.warm_start import widened
 from poise.learn import AmpConfig, LessonConfig, Until
 from poise.motion import ClipLibrary
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.plan import TeacherConfig
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.shapes import BodyShapes
 
 #: Every row adds what its name says to the one before; the last three stand for themselves.
 LADDER = {
@@ -89,7 +90,9 @@ ROWS = (*LADDER, *MORE, *UHC, *INGREDIENTS, *TAUGHT)
 
 def settings(name: str, seed: int) -> Perpetual:
     """One run's."""
-    additive = Perpetual.additive(help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed)
+    additive = StagedPerpetual.additive(
+        help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed
+    )
     # A small library has fewer hard moments, and the budget is small.
     additive = replace(additive, num_envs=512)
     ppo = replace(additive.ppo, minibatch=2048)

@@ -21,7 +21,7 @@ from field.table import field_table
 from torch import Tensor
 
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import RESULT
+from poise.jobs.perpetual.perpetual_run import RESULT
 from poise.learn import LATEST, Policy, load_policy
 from poise.recipes.imitation import Imitation
 from poise.score.episodes import run_episodes

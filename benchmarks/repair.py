@@ -172,17 +172,25 @@ def off_mm(a: Clip, b: Clip) -> float:
 
 
 def seen(clip: Clip, kind: str, mm: float, seed: int) -> Keypoints:
-    """The clip's joints as keypoints with dirt of a kind, each `mm` off on average."""
+    """The clip's joints as keypoints with dirt of a kind, each `mm` off on average; a mixture has all
+    kinds, alike in size."""
     rng, pos = np.random.default_rng(seed), clip.positions()
-    if kind == "dropouts":
+
+    def sized(noise: np.ndarray) -> np.ndarray:
+        return noise * (mm / 1e3 / np.linalg.norm(noise, axis=-1).mean())
+
+    def moves(kind: str) -> np.ndarray:
+        turn, move = KINDS[kind](rng, clip)
+        return sized(turn if turn.any() else np.broadcast_to(move[:, None], turn.shape))
+
+    if kind != "dropouts":
+        pos = pos + sized(np.sum([moves(k) for k in (KINDS if kind == "all" else (kind,))], axis=0))
+    if kind in ("dropouts", "all"):
         length = round(0.3 * clip.fps)
         for j in range(len(clip.skeleton)):
             for _ in range(rng.poisson(clip.seconds / 5)):
                 at = int(rng.integers(1, max(2, clip.frames - length)))
                 pos[at : at + length, j] = np.nan
-    else:
-        noise = KINDS[kind](rng, clip)[0]
-        pos = pos + noise * (mm / 1e3 / np.linalg.norm(noise, axis=-1).mean())
     return Keypoints(clip.skeleton.names, pos, clip.fps, clip.name)
 
 
@@ -423,13 +431,10 @@ def main() -> None:
         command = f"{command} --track"
     else:
         points = o.form == "keypoints"
-        kinds = ["white", "tone5", "tone2", "spikes", "dropouts"]
         clips = list(
             fitted_of(clips_of(o.data, 2 * count), count) if points else clips_of(o.data, count)
         )
-        rows = dirt_rows(
-            clips, o.only or (kinds if points else [*KINDS, "dropouts", "all"]), sizes, points
-        )
+        rows = dirt_rows(clips, o.only or [*KINDS, "dropouts", "all"], sizes, points)
         command = f"{command} --as {o.form}"
     command += f" --clips {o.clips}" if o.clips != CLIPS else ""
     command += f" --only {' '.join(o.only)}" if o.only else ""

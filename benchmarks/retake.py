@@ -18,7 +18,8 @@ import torch
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import Tracked, track
+from poise.jobs.result import Result
+from poise.jobs.track import track
 from poise.jobs.track.retaking import FADE_S
 from poise.jobs.track.simulation import Retake
 from poise.motion import trim
@@ -65,7 +66,7 @@ def measure(path: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def seams(whole: Tracked, again: Tracked) -> dict[str, float]:
+def seams(whole: Result, again: Result) -> dict[str, float]:
     """Jerk about both seams beside that of the clip and of the earlier simulation; what else changed."""
     one, two = whole.evaluation.recordings[0].qpos, again.evaluation.recordings[0].qpos
     rate = whole.imitation.reference.rate_hz

@@ -26,7 +26,7 @@ from poise.env import ImitationEnv
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.perpetual.run import clips_of
+from poise.jobs.perpetual.perpetual_run import clips_of
 from poise.jobs.tracker import save_tracker
 from poise.learn import PolicyBundle
 from poise.recipes.perpetual import build

@@ -1,6 +1,7 @@
 """Counts the concepts of a source tree: sizes, names, settings, cycles, what nothing uses.
 
     python benchmarks/structure.py [SRC]          # by default src/poise; prints JSON
+    python benchmarks/structure.py --before db2811f -o results/structure.csv     # that commit and HEAD
 
 | key | what it counts |
 |---|---|
@@ -11,6 +12,10 @@
 | numeric_constants | names at the top of modules that are numbers, or tuples of numbers |
 | persons | "who", "whose", "somebody" and the like, in comments, docstrings and other strings |
 | cycles | groups of modules that import each other, also inside functions, without `TYPE_CHECKING` |
+| engine_lines, engine_settings_fields | the same without `papers` |
+| track_files, track_depth | modules that `poise track` imports, and the longest chain of them |
+| goal_methods, plugin_methods | public methods of the classes `Goal` and `Plugin` of `env` |
+| repeated_* | names of files and of classes that stand in more than one place |
 | unused_* | public ones whose name stands nowhere but in their definition and in `__init__` files |
 
 Names are compared as words: what shares its name with something used counts as used.
@@ -18,12 +23,16 @@ Names are compared as words: what shares its name with something used counts as 
 
 from __future__ import annotations
 
+import argparse
 import ast
+import csv
 import io
 import json
 import re
 import statistics
-import sys
+import subprocess
+import tarfile
+import tempfile
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
@@ -187,6 +196,19 @@ def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
     return sorted(found)
 
 
+def reach(graph: dict[str, set[str]], start: str) -> tuple[int, int]:
+    """Modules that are imported from `start` on, itself among them, and the longest chain of them."""
+    depth: dict[str, int] = {}
+
+    def visit(v: str) -> int:
+        if v not in depth:
+            depth[v] = 0  # Of a cycle nothing is counted twice.
+            depth[v] = 1 + max((visit(w) for w in graph[v] - {v}), default=0)
+        return depth[v]
+
+    return (visit(start), len(depth))[::-1] if start in graph else (0, 0)
+
+
 def words(tree: ast.Module, imports: bool) -> Counter[str]:
     """How often each name is used in a module; with `imports` those that are imported as well."""
     used: Counter[str] = Counter()
@@ -201,6 +223,9 @@ def words(tree: ast.Module, imports: bool) -> Counter[str]:
             used.update(
                 a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)
             )
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # Tables of names and import paths: "poise.learn:PPOConfig".
+            used.update(re.findall(r"^poise[\w.]*:(\w+)$", node.value))
     return used
 
 
@@ -221,6 +246,8 @@ def structure(source: Path) -> dict[str, Any]:
         used += words(trees[p], imports=p.name != "__init__.py")
     counts: Counter[str] = Counter()
     unused: dict[str, list[str]] = {"functions": [], "classes": [], "methods": []}
+    named: Counter[str] = Counter()
+    hooks: Counter[str] = Counter()
     repeated: Counter[str] = Counter(p.stem for p in paths if p.name != "__init__.py")
     folk: Counter[str] = Counter()
     by_folder: Counter[str] = Counter()
@@ -254,7 +281,11 @@ def structure(source: Path) -> dict[str, Any]:
             if not isinstance(node, ast.ClassDef):
                 counts["functions"] += isinstance(node, Function)
                 continue
+            named[node.name] += 1
             counts["options_classes"] += node.name == "Options"
+            if node.name in ("Goal", "Plugin") and at.startswith("env/"):
+                public = [n for n in node.body if isinstance(n, Function) and n.name[0] != "_"]
+                hooks[node.name] += len(public)
             for method in node.body:
                 if isinstance(method, Function) and not method.name.startswith(("_", "visit_")):
                     unused["methods"] += [f"{at}{node.name}.{method.name}"] * (not used[method.name])
@@ -264,12 +295,15 @@ def structure(source: Path) -> dict[str, Any]:
                 if own and all(f.value is not None for f in own):
                     counts["settings"] += 1
                     counts["settings_fields"] += len(own)
+                    counts["engine_settings_fields"] += len(own) * (not at.startswith("papers/"))
     lengths = {str(p.relative_to(source)): len(t.splitlines()) for p, t in texts.items()}
     longest = max(lengths, key=lambda k: lengths[k])
+    track_files, track_depth = reach(everywhere, f"{source.name}.cli.track")
     public = sum(counts[f"public_{k}"] for k in ("functions", "classes", "constants"))
     return {
         "files": len(paths),
         "lines": sum(lengths.values()),
+        "engine_lines": sum(lengths.values()) - by_folder["papers"],
         "lines_by_folder": dict(sorted(by_folder.items())),
         "code_lines": counts["code_lines"],
         "logical_lines": counts["logical_lines"],
@@ -280,10 +314,17 @@ def structure(source: Path) -> dict[str, Any]:
             k: counts[k]
             for k in ("public_functions", "public_classes", "public_constants", "exported_names")
         },
+        "classes": named.total(),
         **{k: counts[k] for k in ("functions", "dataclasses", "settings", "settings_fields")},
+        "engine_settings_fields": counts["engine_settings_fields"],
+        "track_files": track_files,
+        "track_depth": track_depth,
+        "goal_methods": hooks["Goal"],
+        "plugin_methods": hooks["Plugin"],
         "numeric_constants": counts["numeric_constants"],
         "options_classes": counts["options_classes"],
         "repeated_file_names": sum(n > 1 for n in repeated.values()),
+        "repeated_class_names": sum(n > 1 for k, n in named.items() if k[0] != "_" and k != "Options"),
         "who_whose": folk["who"] + folk["whose"],
         "persons": dict(sorted(folk.items())),
         "cycles_at_the_top": cycles(top),
@@ -293,12 +334,55 @@ def structure(source: Path) -> dict[str, Any]:
     }
 
 
+#: The counts that `results/structure.csv` has of a tree before and after.
+COMPARED = (
+    *("files", "lines", "engine_lines", "classes", "dataclasses", "settings_fields"),
+    *("engine_settings_fields", "options_classes", "track_files", "track_depth", "goal_methods"),
+    *("plugin_methods", "repeated_file_names", "repeated_class_names", "cycles"),
+)
+
+
+def at_commit(commit: str) -> dict[str, Any]:
+    """The counts of the tree of a commit."""
+    tree = ["git", "archive", commit, "src"]
+    with tempfile.TemporaryDirectory() as folder:
+        archive = subprocess.run(tree, cwd=ROOT, check=True, capture_output=True).stdout
+        with tarfile.open(fileobj=io.BytesIO(archive)) as files:
+            files.extractall(folder, filter="data")
+        return structure(Path(folder) / "src/poise")
+
+
+def rows(commits: dict[str, str], command: str) -> Iterator[dict[str, Any]]:
+    """Rows of `results/structure.csv`. commits: by what their trees are called."""
+    for subject, commit in commits.items():
+        counts = at_commit(commit)
+        for metric in COMPARED:
+            value = counts[metric]
+            value = len(value) if isinstance(value, list) else value
+            row = {"subject": subject, "metric": metric, "value": value, "n": 1, "commit": commit}
+            yield row | {"command": command}
+
+
 def main() -> None:
-    """Prints the counts of the folder that is named."""
-    source = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "src/poise"
-    if (source / "poise").is_dir():
-        source = source / "poise"
-    print(json.dumps(structure(source.resolve()), indent=2))
+    """Prints the counts of the folder that is named, or writes those of two commits."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("source", type=Path, nargs="?", default=ROOT / "src/poise")
+    parser.add_argument("--before", metavar="COMMIT")
+    parser.add_argument("--after", metavar="COMMIT", default="HEAD")
+    parser.add_argument("-o", "--out", type=Path, default=ROOT / "results/structure.csv")
+    a = parser.parse_args()
+    if a.before is None:
+        source = a.source / "poise" if (a.source / "poise").is_dir() else a.source
+        print(json.dumps(structure(source.resolve()), indent=2))
+        return
+    short = ["git", "rev-parse", "--short", a.after]
+    after = subprocess.run(short, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+    columns = ["subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command"]
+    command = f"python benchmarks/structure.py --before {a.before}"
+    with a.out.open("w", newline="", encoding="utf-8") as file:
+        write = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+        write.writeheader()
+        write.writerows(rows({"before": a.before, "after": after}, command))
 
 
 if __name__ == "__main__":

@@ -19,9 +19,9 @@ from support_motions import MOTIONS, motion
 
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
-from poise.jobs.track import Tracked, track
+from poise.jobs.result import Result, needs_of
+from poise.jobs.track import track
 from poise.jobs.track.placement import place
-from poise.jobs.track.tracked import needs_of
 from poise.jobs.track.tracking import imitation_of, read_motion
 from poise.jobs.tracker import Tracker
 from poise.kinematics.find_supports import find_supports
@@ -35,7 +35,7 @@ SUFFIXES = (".bvh", ".amc", ".npz", ".npy", ".txt", ".glb")
 HEIGHT_M = 0.1
 
 
-def row(done: Tracked, seconds: float, supports: tuple[Support, ...]) -> dict[str, object]:
+def row(done: Result, seconds: float, supports: tuple[Support, ...]) -> dict[str, object]:
     """What became of a motion. borne: the share of the frames in which `supports` bear the reference in
     which the pelvis is as high; done: tracked, and borne in nine of ten."""
     card, r, rate = done.card, done.evaluation.rollouts, done.imitation.reference.rate_hz

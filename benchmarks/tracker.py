@@ -30,11 +30,12 @@ from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import begin, clips_of, going_on, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, clips_of, going_on, resume, train
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import SMALL_STEP, widened
 from poise.learn import ConvergenceConfig, Until
-from poise.plan import TrajOptConfig
+from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.papers.perpetual.trajopt import TrajOptConfig
 from poise.recipes.perpetual_settings import Perpetual, PushPlan
 
 #: Dances, a kick, boxing and exercises.
@@ -50,7 +51,7 @@ SIXTY = (("(^|-)90_(?!05)", 60.0), ("salsa", 60.0))
 STEP = 2e-4
 
 
-def config(seed: int, paths: bool = False, step: float = STEP) -> Perpetual:
+def config(seed: int, paths: bool = False, step: float = STEP) -> StagedPerpetual:
     """A single network without help, motion prior and recovery, that adds to the reference's angles.
 
     It observes and pays for what the policy that comes with Poise does, its first update on. In the end
@@ -58,7 +59,7 @@ def config(seed: int, paths: bool = False, step: float = STEP) -> Perpetual:
 
     step: of the policy, until then.
     """
-    plain = Perpetual.additive()
+    plain = StagedPerpetual.additive()
     return replace(
         plain,
         single=True,
@@ -88,7 +89,7 @@ def finer(tracker: Tracker, options: argparse.Namespace) -> Perpetual:
             at once, and an hour does not bring it back. `--hips` changes all that is observed.
     """
     a = options
-    kept = going_on(tracker.config, Perpetual(single=True, num_envs=a.worlds, seed=a.seed), True)
+    kept = going_on(tracker.config, Perpetual(num_envs=a.worlds, seed=a.seed))
     recovering = replace(
         kept.recovering,
         demonstration_share=a.recovery,

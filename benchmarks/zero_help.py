@@ -27,8 +27,7 @@ import numpy as np
 import torch
 
 from poise.formats import read_clip
-from poise.jobs.deliver import deliver
-from poise.jobs.run_file import learning_curve
+from poise.jobs.result import Result
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.learn import IterationStats, Until
 from poise.motion import ClipLibrary
@@ -177,7 +176,7 @@ def main() -> None:
     final = watch.check(None)
     policy, meta = trained_policy(out / "run", imitation)
     result = evaluate(imitation, policy, meta)
-    deliver(imitation, result, out, learning_curve(out / "run"))
+    Result(imitation, result, run=out / "run").write(out)
     report = {
         "clip": args.clip,
         "seed": args.seed,

@@ -28,7 +28,7 @@ MARK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Parts of the API page, in its order: a title, a package, its names.
 SHOWN: tuple[tuple[str, str, str], ...] = (
     ("Verbs", "poise", "read write track imitate push inbetween complete dream open_run"),
-    ("Results", "poise", "Tracked Imitated Completed Inbetweened Dreamt Run PoiseError"),
+    ("Results", "poise", "Result Dreamt Run PoiseError"),
     ("Settings", "poise", "TrackConfig ResidualForce Perpetual Inbetween Dream"),
     ("Motion", "poise.motion", "Clip ClipLibrary Skeleton trim resample"),
     ("Motion", "poise.formats", "read_clip write_clip"),
@@ -100,7 +100,7 @@ def _parser(verb: str) -> tuple[str, dict[str, str]]:
 
     from poise.cli import parse
 
-    options = import_module(f"poise.cli.{verb}").Options
+    options = parse.options_of(import_module(f"poise.cli.{verb}"))
     with warnings.catch_warnings(), parse._whole_lines(""):  # pyright: ignore[reportPrivateUsage]
         warnings.simplefilter("ignore")
         made = tyro.extras.get_parser(
@@ -113,7 +113,7 @@ def _parser(verb: str) -> tuple[str, dict[str, str]]:
             title = "options" if group.title in ("positional arguments", "options") else str(group.title)
             head = groups.get(title, "| option | |\n|---|---|")
             groups[title] = "\n".join([head, *rows])
-    return parse.joined(options.__doc__ or ""), groups
+    return parse.summary(options), groups
 
 
 def _option(action: Any) -> str:
@@ -285,7 +285,7 @@ def formats() -> str:
 
 def commands() -> str:
     """The commands of `/live`, with their fields."""
-    from poise.live.commands import COMMANDS
+    from poise.live.protocol import COMMANDS
 
     rows = ["| type | fields |", "|---|---|"]
     rows += [

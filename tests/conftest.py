@@ -1,4 +1,4 @@
-"""Shared fixtures: the real clips, where they are present."""
+"""Marks of the tests that `make test` leaves out, and the real clips, where they are present."""
 
 from __future__ import annotations
 
@@ -9,7 +9,20 @@ from pathlib import Path
 import pytest
 import torch
 
+from marks import MARKS
+
 torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.is_relative_to(here):
+            inside = item.nodeid[len(item.nodeid.split("::")[0]) :]
+            name = item.path.relative_to(here).as_posix() + inside
+            for mark, beginnings in MARKS.items():
+                if name.startswith(beginnings):
+                    item.add_marker(mark)
 
 
 def _find_data() -> Path | None:

@@ -91,7 +91,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an untrained in-betweening network for the embedded walk."""
     from poise.formats import read_clip
-    from poise.learn.inbetween import MODEL, InbetweenModel, make_net, save_model
+    from poise.learn.inbetween_model import MODEL, InbetweenModel, make_net, save_model
     from poise.learn.transition import SkeletonLayout
     from poise.motion.windows import pack_frames
     from toy_windows import SMALL
@@ -139,13 +139,13 @@ def test_commands_are_shown() -> None:
 @pytest.mark.parametrize(("page", "line"), _commands())
 def test_commands_parse(page: str, line: str) -> None:
     from poise.cli.main import VERBS, parser_of
-    from poise.cli.parse import parse
+    from poise.cli.parse import options_of, parse
 
     verb, *rest = shlex.split(line, comments=True)[1:]
     assert verb in VERBS
     try:
         name, prog, rest = parser_of(verb, rest)
-        parse(import_module(f"poise.cli.{name}").Options, rest, prog)
+        parse(options_of(import_module(f"poise.cli.{name}")), rest, prog)
     except PoiseError as problem:
         pytest.fail(f"{page}: {line}: {problem}")
 
@@ -153,12 +153,12 @@ def test_commands_parse(page: str, line: str) -> None:
 def test_named_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
     """Options in running text belong to some verb."""
     from poise.cli.main import VERBS
-    from poise.cli.parse import parse
+    from poise.cli.parse import options_of, parse
 
     known = {"--help", "--version"}
     for verb in (*VERBS, "play_compliant"):
         with contextlib.suppress(SystemExit):
-            parse(import_module(f"poise.cli.{verb}").Options, ["--help"], f"poise {verb}")
+            parse(options_of(import_module(f"poise.cli.{verb}")), ["--help"], f"poise {verb}")
         known |= set(re.findall(r"--[a-z][\w-]*", capsys.readouterr().out))
     for page in PAGES:
         named = set(re.findall(r"`[^`\n]*?(--[a-z][\w.-]*)", _text(page)))

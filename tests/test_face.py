@@ -14,6 +14,7 @@ import pytest
 
 import poise
 from poise.cli.main import main
+from poise.motion import trim
 from poise.recipes import build
 from refusals import refused
 from toy_human import swing
@@ -49,12 +50,12 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def imitated(clip: Path) -> poise.Imitated:
+def imitated(clip: Path) -> poise.Result:
     return poise.imitate(str(clip), iterations=2, threads=1, num_envs=16)
 
 
 def test_imitate_gives_the_numbers_of_the_command(
-    clip: Path, imitated: poise.Imitated, tmp_path: Path
+    clip: Path, imitated: poise.Result, tmp_path: Path
 ) -> None:
     out = tmp_path / "cli"
     small = ["--iterations", "2", "--envs", "16", "--threads", "1"]
@@ -68,17 +69,17 @@ def test_imitate_gives_the_numbers_of_the_command(
     np.testing.assert_array_equal(poise.read(paths["simulated"]).rot, written.rot)
     # What was saved opens again.
     again = poise.open_run(tmp_path / "python")
-    assert again.recipe == "residual-force" and again.config == imitated.task.config
+    assert again.recipe == "residual-force" and again.config == imitated.imitation.config
     apart = {"delivered": 0, "nothing": 0}
     assert figures(again.score()) | apart == figures(imitated.card) | apart
 
 
-def test_what_it_shows(imitated: poise.Imitated, tmp_path: Path) -> None:
-    source = imitated.task.library.clips[0]
+def test_what_it_shows(imitated: poise.Result, tmp_path: Path) -> None:
+    source = imitated.imitation.library.clips[0]
     assert imitated.clip.skeleton == source.skeleton and imitated.clip.frames == source.frames
     assert imitated.notes and all(isinstance(n, str) for n in imitated.notes)
-    assert repr(imitated).startswith("Imitated('swing', 0.5 s, success ") and len(repr(imitated)) < 120
-    assert len(repr(imitated.task)) < 120 and len(repr(poise.open_run())) < 200
+    assert repr(imitated).startswith("Result('swing', 0.5 s, success ") and len(repr(imitated)) < 120
+    assert len(repr(imitated.imitation)) < 120 and len(repr(poise.open_run())) < 200
     page = imitated._repr_html_()
     assert page.count("<svg") == 1 and "Success" in page and "<script" not in page
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
@@ -111,14 +112,16 @@ def test_a_folder_is_gone_on_with(tmp_path: Path) -> None:
 
 
 def test_track_gives_the_numbers_of_the_command(tmp_path: Path) -> None:
-    tracked = poise.track(WALK)
-    assert main(["track", str(WALK), "-o", str(tmp_path / "out")]) == 0
+    short = tmp_path / "walk.bvh"
+    poise.write(trim(poise.read(WALK), 0, 20), short)
+    tracked = poise.track(short)
+    assert main(["track", str(short), "-o", str(tmp_path / "out")]) == 0
     said = json.loads((tmp_path / "out/score.json").read_text())
     assert figures(tracked.card) == figures(said)
     written = poise.read(tmp_path / "out/simulated.bvh")
     paths = tracked.save(tmp_path / "python")
     np.testing.assert_array_equal(poise.read(paths["simulated"]).rot, written.rot)
-    assert repr(tracked).startswith("Tracked('walk'") and "<svg" in tracked._repr_html_()
+    assert repr(tracked).startswith("Result('walk'") and "<svg" in tracked._repr_html_()
     assert tracked.clip.skeleton.names == poise.read(WALK).skeleton.names
 
 

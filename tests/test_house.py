@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 from pathlib import Path
 
 import pytest
+
+from marks import MARKS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "poise"
@@ -49,10 +52,21 @@ def _hits(files: list[Path], patterns: tuple[str, ...]) -> list[str]:
     ]
 
 
+@functools.cache
+def _nodes(file: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
+def _dotted(node: ast.expr) -> str:
+    """`a.b.c`, or "" for what is no name."""
+    if isinstance(node, ast.Attribute):
+        return f"{_dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
 def _calls(file: Path) -> list[tuple[int, str]]:
     """Line and dotted name of every call in a file."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    return [(n.lineno, ast.unparse(n.func)) for n in ast.walk(tree) if isinstance(n, ast.Call)]
+    return [(n.lineno, _dotted(n.func)) for n in _nodes(file) if isinstance(n, ast.Call)]
 
 
 def test_only_the_command_line_prints() -> None:
@@ -74,7 +88,7 @@ def test_nothing_that_is_loaded_can_run_code() -> None:
     unsafe_calls |= {"pickle.load", "pickle.loads", "pickle.Unpickler", "pickle._Unpickler"}
     found = []
     for file in _python():
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in _nodes(file):
             names = []
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
@@ -102,6 +116,16 @@ def test_nothing_is_left_unfinished() -> None:
 
 def test_every_module_says_what_it_is() -> None:
     silent = [
-        f.relative_to(ROOT) for f in _python() if not ast.get_docstring(ast.parse(f.read_text("utf-8")))
+        f.relative_to(ROOT)
+        for f in _python()
+        if not ast.get_docstring(_nodes(f)[0])  # type: ignore[arg-type]
     ]
     assert silent == []
+
+
+def test_marks_are_of_tests_that_exist() -> None:
+    tests = ROOT / "tests"
+    for begins in (name for names in MARKS.values() for name in names):
+        file, _, test = begins.partition("::")
+        found = [f for f in tests.rglob("*.py") if f.relative_to(tests).as_posix().startswith(file)]
+        assert found and (not test or f"\ndef {test}" in found[0].read_text("utf-8")), begins

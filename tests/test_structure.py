@@ -24,18 +24,16 @@ EXPLAINED = {
     "twins in tests and benchmarks": (
         "control/pd.py:stable_pd_torque", "sim/backend.py:body_angular_velocity_w",
         "sim/backend.py:body_linear_velocity_w", "sim/backend.py:body_com_velocity_w",
-        "metrics/plausibility.py:uhc_skate", "metrics/plausibility.py:uhc_penetration",
-        "metrics/plausibility.py:physdiff_penetrate", "metrics/plausibility.py:physdiff_float",
-        "metrics/tracking.py:mpjpe_pa",
+        "metrics/tracking_errors.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
-        "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
+        "jobs/track/noise.py:robustness",
         "jobs/tracker.py:Tracker.with_damping",
         "papers/compliant/figures.py:throws",
     ),
     "analytic inverse kinematics, which keyframes will need": (
         "kinematics/ik.py:clip_ik",
-        "kinematics/ik.py:polish", "kinematics/limbs.py:two_bone",
+        "kinematics/ik.py:polish",
     ),
     "for users of the library": (
         "jobs/imitate.py:imitate", "score/card.py:read_score", "env/faces.py:GymVectorEnv",
@@ -43,7 +41,7 @@ EXPLAINED = {
         "formats/smpl.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField", "sim/floor.py:Steps",
         "sim/props.py:Lift",
-        "papers/compliant/opponents.py:Teams", "papers/compliant/training.py:save_learned",
+        "papers/compliant/opponents.py:Teams", "papers/compliant/scene_training.py:save_learned",
     ),
     "called by the libraries that they belong to": (
         "env/faces.py:GymVectorEnv.close_extras", "formats/pickles.py:_Machine.find_class",

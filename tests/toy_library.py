@@ -10,8 +10,9 @@ from torch import Tensor
 
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
 from poise.motion import Clip, ClipLibrary
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
+from poise.recipes.perpetual_settings import RecoveryPlan
 from poise.score import ClipResults
 from toy_human import swing
 
@@ -42,7 +43,7 @@ def lively() -> ClipLibrary:
     return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
 
 
-def tiny(**changes: object) -> Perpetual:
+def tiny(**changes: object) -> StagedPerpetual:
     """Settings by which a stage takes a second."""
     plain = {
         "num_envs": 8,
@@ -64,7 +65,7 @@ def tiny(**changes: object) -> Perpetual:
         "style": STYLE,
         "ppo": PPO,
     }
-    return Perpetual(**(plain | changes))  # type: ignore[arg-type]
+    return StagedPerpetual(**(plain | changes))  # type: ignore[arg-type]
 
 
 class Scripted:

@@ -1,10 +1,9 @@
 """The field's tracking table: success and errors as Perpetual Humanoid Control and UHC report them.
 
-Per frame and over all bodies, in mm at 30 Hz (see `metrics.tracking`): g-MPJPE in the world, MPJPE after
-each root is subtracted, PA-MPJPE after Procrustes, velocity (mm/frame) and acceleration (mm/frame^2).
-The published code pools the frames of all clips and prints figures with and without failed clips; both
-choices stand side by side here with the mean over clips, since they differ.
-"""
+Per frame and over all bodies, in mm at 30 Hz (see `metrics.tracking_errors`): g-MPJPE in the world,
+MPJPE after each root is subtracted, PA-MPJPE after Procrustes, velocity (mm/frame) and acceleration
+(mm/frame^2). The published code pools the frames of all clips and prints figures with and without
+failed clips; both choices stand side by side here with the mean over clips, since they differ."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import clips_of
+from poise.jobs.perpetual.perpetual_run import clips_of
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.motion import ClipLibrary

@@ -24,15 +24,16 @@ from poise.version import __version__
 
 if TYPE_CHECKING:
     from poise.formats import write_clip as write
-    from poise.jobs.complete import Completed, complete
+    from poise.jobs.complete import complete
     from poise.jobs.endless.dreaming import dream
     from poise.jobs.endless.dreamt import Dream, Dreamt
-    from poise.jobs.imitate import Imitated, imitate
-    from poise.jobs.inbetween.fill import Inbetweened, inbetween
-    from poise.jobs.inbetween.settings import Inbetween
+    from poise.jobs.imitate import imitate
+    from poise.jobs.inbetween.fill import inbetween
+    from poise.jobs.inbetween.inbetween_settings import Inbetween
     from poise.jobs.open import Run, open_run
     from poise.jobs.push import push
-    from poise.jobs.track import TrackConfig, Tracked, track
+    from poise.jobs.result import Result
+    from poise.jobs.track import TrackConfig, track
     from poise.kinematics.rate import read_clip as read
     from poise.motion import Clip, ClipLibrary
     from poise.recipes import ResidualForce
@@ -42,17 +43,14 @@ if TYPE_CHECKING:
 _PLACES = {
     "Clip": "poise.motion",
     "ClipLibrary": "poise.motion",
-    "Completed": "poise.jobs.complete",
     "Dream": "poise.jobs.endless.dreamt",
     "Dreamt": "poise.jobs.endless.dreamt",
-    "Imitated": "poise.jobs.imitate",
-    "Inbetween": "poise.jobs.inbetween.settings",
-    "Inbetweened": "poise.jobs.inbetween.fill",
+    "Inbetween": "poise.jobs.inbetween.inbetween_settings",
     "Perpetual": "poise.recipes.perpetual",
     "ResidualForce": "poise.recipes",
+    "Result": "poise.jobs.result",
     "Run": "poise.jobs.open",
     "TrackConfig": "poise.jobs.track",
-    "Tracked": "poise.jobs.track",
     "complete": "poise.jobs.complete",
     "dream": "poise.jobs.endless.dreaming",
     "imitate": "poise.jobs.imitate",
@@ -67,18 +65,15 @@ _PLACES = {
 __all__ = [
     "Clip",
     "ClipLibrary",
-    "Completed",
     "Dream",
     "Dreamt",
-    "Imitated",
     "Inbetween",
-    "Inbetweened",
     "Perpetual",
     "PoiseError",
     "ResidualForce",
+    "Result",
     "Run",
     "TrackConfig",
-    "Tracked",
     "__version__",
     "complete",
     "dream",

@@ -299,7 +299,7 @@ def _declared(kind: type) -> tuple[tuple[_Declared, str, float, float], ...]:
     """Declarations of the fields of a dataclass, but for those that may be anything: each with its
     name and the limits of a plain number."""
     # Settings of other modules check themselves; they need not be imported for this.
-    others = {place.partition(":")[2]: object for place in _places(kind)}
+    others = {place.partition(":")[2]: object for place in _places(kind).values()}
     hints = get_type_hints(kind, localns=others or None, include_extras=True)
     out: list[tuple[_Declared, str, float, float]] = []
     for f in fields(kind):
@@ -466,15 +466,19 @@ def imported(place: str) -> Any:
 
 @cache
 def _types(kind: type) -> dict[str, Any]:
-    return get_type_hints(
-        kind, localns={p.partition(":")[2]: imported(p) for p in _places(kind)} or None
+    places = _places(kind)
+    hints = get_type_hints(
+        kind, localns={p.partition(":")[2]: imported(p) for p in places.values()} or None
     )
+    # A module may not name settings of a folder above it: there a part that is made is typed `Any`.
+    own = {k: imported(p) for k, p in places.items() if hints[k] is Any and getattr(kind, k, p) == p}
+    return hints | own
 
 
-def _places(kind: type) -> list[str]:
-    """The places of settings of other modules in a dataclass, see `part`."""
+def _places(kind: type) -> dict[str, str]:
+    """The places of settings of other modules in a dataclass, by field, see `part`."""
     own: dict[str, Field[Any]] = getattr(kind, "__dataclass_fields__", {})
-    return [f.metadata["place"] for f in own.values() if "place" in f.metadata]
+    return {f.name: f.metadata["place"] for f in own.values() if "place" in f.metadata}
 
 
 def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:

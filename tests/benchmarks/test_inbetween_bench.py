@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from inbetween import best_setting, choose_iterations
 
-from poise.learn.inbetween import Adaptation, make_net
+from poise.learn.inbetween_model import Adaptation, make_net
 from toy_windows import SMALL, bank, known, layout
 
 

@@ -7,7 +7,7 @@ import torch
 from next_frames import NextFrame, NextFrameConfig, NextFrameObjective, NextFrames
 
 from poise.learn.cvae import PackedFrames
-from poise.learn.inbetween import InbetweenTrainer
+from poise.learn.inbetween_model import InbetweenTrainer
 from poise.synthesis.generator import ROOT
 from refusals import refused
 

@@ -16,14 +16,14 @@ import pytest
 import torch
 
 from poise.formats import write_clip
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.learn import ConvergenceConfig, Until
 from poise.learn.composer import Composer
 from poise.motion import ClipLibrary
+from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.recipes.body_shapes import BodyShapes, shaped
 from poise.recipes.perpetual import build, task
-from poise.recipes.perpetual_settings import Perpetual
-from poise.recipes.shapes import BodyShapes, shaped
 from refusals import refused
 from toy_policy import PPO, toy_run, walk
 
@@ -63,7 +63,7 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("composed")
     plain = {"num_envs": 8, "evaluate_every": 1, "seed": 1, "expert": False, "style": None, "ppo": PPO}
     sizes = {"max_primitives": 2, "composer_hidden": (8,), "composer_clone": False}
-    config = Perpetual(**(plain | sizes), convergence=ConvergenceConfig(patience=1))  # type: ignore[arg-type]
+    config = StagedPerpetual(**(plain | sizes), convergence=ConvergenceConfig(patience=1))  # type: ignore[arg-type]
     library = ClipLibrary.of([walk(0, 30, "first"), walk(25, 60, "second")])
     imitation = perpetual_run.begin(folder, library, config)
     perpetual_run.train(imitation, folder, Until(iterations=8), threads=1, tensorboard=False)

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from tiny_clips import deepmimic, put
 
+from poise.cli import train_perpetual
 from poise.cli.main import main
 from poise.jobs.open import open_run
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import LATEST, CloneConfig, PPOConfig
-from poise.recipes import perpetual
-from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
+from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.recipes.perpetual_settings import RecoveryPlan
 from poise.settings import from_toml
 
 MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
@@ -28,11 +29,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     own = {"ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None}
     own["recovering"] = RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2))
 
-    def plain(**given: object) -> Perpetual:
-        return Perpetual(**(own | given))
+    def plain(additive: bool) -> StagedPerpetual:
+        return StagedPerpetual.additive(**own) if additive else StagedPerpetual(**own)
 
-    plain.additive = lambda: Perpetual.additive(**own)
-    monkeypatch.setattr(perpetual, "Perpetual", plain)
+    monkeypatch.setattr(train_perpetual, "recipe", plain)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_a_run_goes_on_from_another_ones_policy(
     assert main([*go_on, "--print-config"]) == 0
     said = tmp_path / "said.toml"
     said.write_text(capsys.readouterr().out)
-    assert from_toml(Perpetual, said) == config
+    assert from_toml(StagedPerpetual, said) == config
     # What does not fit is refused before anything is written.
     wide = [str(tmp_path / "wide") if x == str(then) else x for x in go_on]
     assert main([*wide, "--ppo.smooth-over", "[1,9999]"]) == 2

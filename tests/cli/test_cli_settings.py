@@ -17,19 +17,19 @@ from poise.cli.main import main
 from poise.cli.parse import parse
 from poise.cli.settings import SOURCES, configured, dotted, stated
 from poise.formats import read_clip
-from poise.jobs.endless.training import Endless
-from poise.jobs.inbetween.training import Inbetween
+from poise.jobs.endless.endless_training import Endless
+from poise.jobs.inbetween.inbetween_training import Inbetween
 from poise.jobs.presets import preset_of
-from poise.papers.compliant.training import Compliant
-from poise.plan import TrajOptConfig
+from poise.papers.compliant.scene_training import Compliant
+from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.papers.perpetual.trajopt import TrajOptConfig
 from poise.recipes import ResidualForce
-from poise.recipes.perpetual_settings import Perpetual
 from poise.settings import imported
 from refusals import refused
 
 KINDS: dict[str, Any] = {
     "residual-force": ResidualForce,
-    "perpetual": Perpetual,
+    "perpetual": StagedPerpetual,
     "inbetween": Inbetween,
     "endless": Endless,
     "compliant": Compliant,
@@ -81,8 +81,8 @@ def test_options_need_neither_torch_nor_mujoco() -> None:
 def test_parts_are_made_when_they_are_needed() -> None:
     @dataclass(frozen=True)
     class Whole:
-        part_: Any = settings.part("poise.plan:TrajOptConfig", iterations=7)
-        none: Any = settings.part("poise.plan:TrajOptConfig", made=False)
+        part_: Any = settings.part("poise.papers.perpetual.trajopt:TrajOptConfig", iterations=7)
+        none: Any = settings.part("poise.papers.perpetual.trajopt:TrajOptConfig", made=False)
 
     assert Whole() == Whole(TrajOptConfig(iterations=7), None)
     assert Whole().part_ is not Whole().part_
@@ -97,9 +97,9 @@ def test_every_derived_option_has_a_help_text() -> None:
 
 def test_python_and_the_command_line_have_the_same_defaults() -> None:
     assert imitates() == ResidualForce() and trains("residual-force") == ResidualForce()
-    assert trains("perpetual") == Perpetual() and trains("inbetween") == Inbetween()
+    assert trains("perpetual") == StagedPerpetual() and trains("inbetween") == Inbetween()
     assert trains("endless") == Endless()
-    assert trains("perpetual", "--action", "additive") == Perpetual.additive()
+    assert trains("perpetual", "--action", "additive") == StagedPerpetual.additive()
 
 
 def test_what_is_stated_reaches_the_settings() -> None:
@@ -115,7 +115,7 @@ def test_what_is_stated_reaches_the_settings() -> None:
         ppo=replace(plain.ppo, policy_lr=1e-4), sim=replace(plain.sim, rate_hz=120),
     )  # fmt: skip
     made = trains("perpetual", "--paths", "11", "--no-style", "--no-recovery-clips", "--single")
-    plain = Perpetual()
+    plain = StagedPerpetual()
     assert made == replace(
         plain, single=True, help_start=0.0, trajopt=TrajOptConfig(iterations=11), style=None,
         recovering=replace(plain.recovering, demonstrations=0),
@@ -171,4 +171,4 @@ def test_dotted_options_are_settings() -> None:
         dotted(["--a.b"])
     settings, other = stated(("ppo.policy-lr=1e-4", "lfoot.kp=3", "action=absolute"), ResidualForce)
     assert settings == {"ppo.policy_lr": 1e-4, "action": "absolute"} and other == ["lfoot.kp=3"]
-    assert configured(plain := Perpetual(style=None), {}) is plain
+    assert configured(plain := StagedPerpetual(style=None), {}) is plain

@@ -15,6 +15,7 @@ from poise.kinematics import examine
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.skeleton import Source
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +92,13 @@ def test_what_the_user_states_goes_before_what_was_measured(truth: Clip) -> None
     filtered = fit_clip(points_of(truth, seen), FitConfig(smooth_hz=8.0))
     assert not filtered.skeleton.source.mended
     assert off_mm(filtered.positions(), truth.positions()) > 15.0
+
+
+def test_keypoints_that_jump_about_are_no_motion(truth: Clip) -> None:
+    rng = np.random.default_rng(0)
+    places = truth.positions()[:1] + 0.3 * rng.standard_normal(truth.positions().shape)
+    with refused("only-noise"):
+        fit_clip(points_of(truth, places))
 
 
 def test_a_body_that_bounces_does_not_tremble(truth: Clip) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from poise.jobs.track.controllers import LOST, SURVIVED, TRACKED, Merit, merit
+from poise.jobs.result import LOST, SURVIVED, TRACKED, Merit, merit
 from poise.metrics import has_lost, success_rule
 from poise.score import ScoreCard, score_rollouts
 from poise.score.card import NO_HELP

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from poise.formats import read_clip
-from poise.jobs.deliver import deliver, finished, floor_of, lost_at, simulated_clip
+from poise.jobs.deliver import finished, floor_of, lost_at, simulated_clip
+from poise.jobs.result import Result
 from poise.jobs.runs import Evaluation, evaluate
 from poise.kinematics import examine, sole_slide
 from poise.motion import Clip, ClipLibrary, ground_shift
@@ -117,11 +118,11 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     policy = Nothing(len(imitation.humanoid.hinges) + extra)
     evaluation = evaluate(imitation, policy, {})  # type: ignore[arg-type]
     raw = simulated_clip(imitation, evaluation)
-    done = deliver(imitation, evaluation, tmp_path / "raw", {}, tmp_path / "raw.npz", hold=False)
+    done = Result(imitation, evaluation).write(tmp_path / "raw", tmp_path / "raw.npz", hold=False)
     assert done.card.delivered == () and not any("held" in note for note in done.notes)
     off = read_clip(tmp_path / "raw.npz").positions() - raw.positions()
     assert np.ptp(off, axis=(0, 1)).max() < 1e-9 and abs(off[0, 0, 2] - floor_of(imitation)) < 0.046
-    done = deliver(imitation, evaluation, tmp_path / "held", {})
+    done = Result(imitation, evaluation).write(tmp_path / "held")
     (figures,) = json.loads((tmp_path / "held/score.json").read_text())["delivered"]
     deep = "point_penetration_mm"
     assert figures["delivered"][deep] <= figures["simulated"][deep] + 0.1

@@ -17,10 +17,11 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.text import write_whole
 from poise.jobs.open import open_run
-from poise.jobs.result import Result, ResultView
+from poise.jobs.result import Result
 from poise.jobs.runs import train
 from poise.learn import Until
 from poise.motion import Clip, trim
+from poise.synthesis.inbetween import FilledClips
 from refusals import refused
 
 OLD = Path(__file__).resolve().parents[1] / "fixtures/old"
@@ -131,21 +132,19 @@ def test_run_files_that_are_cut_are_refused_and_left_as_they_are(tmp_path: Path,
         assert {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()} == before
 
 
-class _Made(Result):
+class _Broken:
+    """Clips that cannot be made."""
+
+    @property
+    def clips(self) -> tuple[Clip, ...]:
+        raise PoiseError("nothing to write", code="internal-fault")
+
+
+def _made(fails: bool = False) -> Result:
     """A result that writes one file, or fails."""
-
-    def __init__(self, fails: bool = False) -> None:
-        self.fails = fails
-
-    def _shown(self) -> ResultView:
-        clip = trim(read_clip(WALK), 0, 3)
-        return ResultView(clip, clip, None, ())
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        if self.fails:
-            raise PoiseError("nothing to write", code="internal-fault")
-        write_clip(self._shown().clip, folder / "simulated.bvh")
-        return {"simulated": folder / "simulated.bvh"}
+    clip = trim(read_clip(WALK), 0, 3)
+    filled: Any = _Broken() if fails else FilledClips((clip,), ())
+    return Result(filled=filled, came=clip)
 
 
 def test_results_are_refused_where_no_folder_can_be(tmp_path: Path, monkeypatch) -> None:
@@ -153,22 +152,22 @@ def test_results_are_refused_where_no_folder_can_be(tmp_path: Path, monkeypatch)
     (tmp_path / "keep").write_text("kept")
     for name in ("keep.txt/x", "keep.txt/x/y", "keep"):
         with refused("not-a-folder", says="keep"):
-            _Made().save(tmp_path / name)
+            _made().save(tmp_path / name)
     for name in ("keep.txt/x.bvh", "keep.txt/x.glb", "a\0b", "n" * 300):
         with refused("cannot-write"):
-            _Made().save(tmp_path / name)
+            _made().save(tmp_path / name)
     with refused("internal-fault"):
-        _Made(fails=True).save(tmp_path / "new/deep")
+        _made(fails=True).save(tmp_path / "new/deep")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["keep", "keep.txt"]
     for name in ("new/deep", "run_v1.0"):
-        assert set(_Made().save(tmp_path / name)) == {"simulated"}
+        assert set(_made().save(tmp_path / name)) == {"filled"}
 
     def denied(*given: Any, **named: Any) -> NoReturn:
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", denied)
     with refused("cannot-write", says=("other", "permission denied")):
-        _Made().save(tmp_path / "other")
+        _made().save(tmp_path / "other")
     monkeypatch.setattr(Path, "exists", denied)
     with refused("cannot-write", says=("other.bvh", "permission denied")):
-        _Made().save(tmp_path / "other.bvh")
+        _made().save(tmp_path / "other.bvh")

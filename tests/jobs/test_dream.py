@@ -16,8 +16,8 @@ from poise.formats import read_clip
 from poise.jobs.endless import dreamt as frames
 from poise.jobs.endless.dreaming import begun, dream, past_of
 from poise.jobs.endless.dreamt import NUMBER, ClipMaker, Dream, FrameStore, MotionWriter, Pieces
+from poise.jobs.endless.endless_training import Endless, motions_of, train_generator
 from poise.jobs.endless.model import GeneratorModel
-from poise.jobs.endless.training import Endless, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
@@ -52,14 +52,14 @@ def test_it_goes_about_and_is_written(model: GeneratorModel, tracker: Tracker, t
         1.5, model, tracker, how, out=tmp_path / "live.bvh",
         progress=lambda what, k, n: told.append(k),
     )  # fmt: skip
-    assert made.motion.frames == made.asked.frames == told[-1] == 45
+    assert made.motion().frames == made.source.frames == told[-1] == 45
     assert "1.5 s without help" in made.sentence and made.paths == (tmp_path / "live.bvh",)
     # The character begins on its motion and moves as it is asked to.
-    apart = np.linalg.norm(made.motion.positions() - made.asked.positions(), axis=-1).mean(1)
+    apart = np.linalg.norm(made.motion().positions() - made.source.positions(), axis=-1).mean(1)
     assert apart[:15].mean() < 0.1
-    assert np.isfinite(made.motion.positions()).all()
+    assert np.isfinite(made.motion().positions()).all()
     same = dream(1.5, model, tracker, how)
-    np.testing.assert_array_equal(same.motion.rot, made.motion.rot)
+    np.testing.assert_array_equal(same.motion().rot, made.motion().rot)
     # What is written as it is made is the motion.
     live = read_clip(tmp_path / "live.bvh")
     np.testing.assert_allclose(live.positions(), made.clip.positions(), atol=1e-3)
@@ -81,7 +81,7 @@ def test_it_goes_on_from_a_clip_of_any_skeleton(model: GeneratorModel, tracker: 
     assert float((pasts[1, -1, :2] - pasts[0, -1, :2]).norm()) == pytest.approx(2.0)
     torch.testing.assert_close(pasts[0, :, 2:], past[:, 2:])
     made = dream(0.4, model, tracker, seed_clip=walk(), controller="policy", threads=1)
-    assert made.motion.frames == 12
+    assert made.motion().frames == 12
     with refused("clip-too-short", says=("10 frames", "30 Hz", "5")):
         dream(1.0, model, tracker, seed_clip=trim(walk(), 0, 5))
 
@@ -121,7 +121,7 @@ def test_a_world_that_goes_bad_is_put_back(
 
     bad = replace(tracker, policy=Bad())  # type: ignore[arg-type]
     made = dream(1.0, model, bad, controller="policy", threads=1)
-    assert made.motion.frames == 30 and np.isfinite(made.motion.positions()).all()
+    assert made.motion().frames == 30 and np.isfinite(made.motion().positions()).all()
     assert any("went bad at 0.3 s" in n for n in made.notes)
 
 

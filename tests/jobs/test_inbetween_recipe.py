@@ -10,8 +10,8 @@ import pytest
 
 from poise.cli.main import main
 from poise.formats import read_clip, write_bvh
-from poise.jobs.inbetween.settings import small
-from poise.jobs.inbetween.training import (
+from poise.jobs.inbetween.inbetween_settings import small
+from poise.jobs.inbetween.inbetween_training import (
     FRAMES,
     Inbetween,
     begin,
@@ -23,7 +23,7 @@ from poise.jobs.inbetween.training import (
 )
 from poise.jobs.run_file import RUN_FILE
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.inbetween import load_model, save_model
+from poise.learn.inbetween_model import load_model, save_model
 from refusals import refused
 from toy_human import swing
 
@@ -64,7 +64,7 @@ def test_a_library_is_read_once(library: Path, tmp_path: Path, monkeypatch: pyte
     cache = tmp_path / "bank.safetensors"
     first, _ = library_bank(library, cache)
     reads: list[Path] = []
-    monkeypatch.setattr("poise.jobs.inbetween.training.read_clip", lambda p: reads.append(p))
+    monkeypatch.setattr("poise.jobs.inbetween.inbetween_training.read_clip", lambda p: reads.append(p))
     again, _ = library_bank(library, cache)
     assert reads == [] and again.clips == first.clips and bool((again.rot == first.rot).all())
     assert again.facing == first.facing and again.feet == first.feet
@@ -121,6 +121,7 @@ def test_a_run_of_before_a_setting_existed_goes_on(run: Path, library: Path, tmp
 def test_poise_inbetween_meets_its_keyframes(run: Path, library: Path, tmp_path: Path) -> None:
     source, out = library / "walk_plain_3.bvh", tmp_path / "out.bvh"
     argv = ["inbetween", str(source), "--keyframes", "5,35,50", "-o", str(out), "--model", str(run)]
+    argv += ["--adapt", "2"]
     assert main(argv) == 0
     a, b = read_clip(source), read_clip(out)
     assert b.frames == a.frames
@@ -158,10 +159,8 @@ def test_half_precision_models_are_used_alike(run: Path, library: Path, tmp_path
     for folder in (run, tmp_path):
         out = tmp_path / f"out-{len(outs)}.bvh"
         source = str(library / "walk_plain_3.bvh")
-        assert (
-            main(["inbetween", source, "--keyframes", "5,35", "-o", str(out), "--model", str(folder)])
-            == 0
-        )
+        argv = ["inbetween", source, "--keyframes", "5,35", "-o", str(out), "--model", str(folder)]
+        assert main([*argv, "--adapt", "0"]) == 0
         outs.append(read_clip(out).positions())
     assert np.abs(outs[0] - outs[1]).max() < 0.01
 

@@ -10,10 +10,10 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.jobs.perpetual.evaluation import EvaluationLog, evaluate_clips
-from poise.jobs.perpetual.stage_start import Owners
 from poise.learn import PolicyBundle, compose, first_column, next_column
 from poise.learn.primitives import primitive
 from poise.metrics import mpjpe_global
+from poise.papers.perpetual.primitive_stages import Owners
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from poise.score import ClipResults, run_episodes, score_rollouts

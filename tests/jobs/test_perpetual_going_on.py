@@ -12,13 +12,14 @@ import torch
 from poise.body import BodyConfig
 from poise.env.yielding import Yielding
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import begin, going_on, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.jobs.warm_start import widened
 from poise.learn import Until, Value
 from poise.motion import ClipLibrary
 from poise.motion.rotations import quat_mul
+from poise.papers.perpetual.ablations import going_on
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import PushPlan

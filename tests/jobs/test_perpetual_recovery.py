@@ -16,15 +16,15 @@ from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import evaluation as perpetual_recovery
 from poise.jobs.perpetual.evaluation import RECOVERY_WORTH, StageRecord, back, check_falls, try_recovery
-from poise.jobs.perpetual.run import begin, train
-from poise.jobs.perpetual.stage_order import Progress, Stage
-from poise.jobs.perpetual.stage_start import Owners, staged
+from poise.jobs.perpetual.perpetual_run import begin, train
+from poise.jobs.perpetual.stages import Progress, Stage, staged
 from poise.jobs.run_file import FINAL, RUN_FILE
 from poise.learn import Until, compose, first_column, load_checkpoint, load_policy, next_column
 from poise.learn.checkpoint import save_checkpoint
 from poise.learn.composer import Composer
 from poise.learn.primitives import primitive
 from poise.motion import Clip, ClipLibrary
+from poise.papers.perpetual.primitive_stages import Owners
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build, standing, walking_clips
 from poise.recipes.perpetual_settings import Perpetual, config_of

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.jobs.perpetual import stage_start as perpetual_next
-from poise.jobs.perpetual import stage_trainer as perpetual_stages
-from poise.jobs.perpetual.run import begin, resume, train
-from poise.jobs.perpetual.stage_order import Progress, Stage
+from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
+from poise.jobs.perpetual.stages import Progress, Stage
 from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary
+from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.papers.perpetual.primitive_stages import PrimitiveOrder
 from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.settings import to_data
 from refusals import refused
@@ -111,11 +111,11 @@ def test_a_killed_run_goes_on_from_an_older_checkpoint(whole: Path, tmp_path: Pa
     assert_same(whole, tmp_path)
 
 
-@pytest.mark.parametrize("step", ["begin_stage", "make_trainer"])
+@pytest.mark.parametrize("step", ["next", "trainer"])
 def test_a_run_killed_between_any_two_stages_ends_the_stage_again(
     whole: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain, died = getattr(perpetual_next, step), set()
+    plain, died = getattr(PrimitiveOrder, step), set()
 
     def dying(*args: object, **more: object) -> object:
         stage = next(x for x in args if isinstance(x, Stage))
@@ -124,7 +124,7 @@ def test_a_run_killed_between_any_two_stages_ends_the_stage_again(
             raise KilledError
         return plain(*args, **more)
 
-    monkeypatch.setattr(perpetual_stages, step, dying)
+    monkeypatch.setattr(PrimitiveOrder, step, dying)
     for _ in STAGES[1:]:
         with pytest.raises(KilledError):
             go_on(tmp_path)
@@ -156,16 +156,16 @@ def test_a_finished_run_goes_on_with_more_time(tmp_path: Path) -> None:
 
 
 def test_settings_for_additive_actions() -> None:
-    config = Perpetual.additive(single=True, num_envs=8)
+    config = StagedPerpetual.additive(single=True, num_envs=8)
     assert (config.action, config.style, config.single, config.num_envs) == ("additive", None, True, 8)
     assert config.ppo.std == 0.055 and config_of(to_data(config)) == config
 
 
 def test_settings_survive_json() -> None:
-    for config in (tiny(), tiny(style=None, lateral=True, start="random"), Perpetual()):
+    for config in (tiny(), tiny(style=None, lateral=True, start="random"), StagedPerpetual()):
         assert config_of(to_data(config)) == config
     with refused("unknown-setting", says="colour"):
-        config_of(to_data(Perpetual()) | {"colour": 3})
+        config_of(to_data(StagedPerpetual()) | {"colour": 3})
 
 
 def test_another_run_in_the_folder_is_refused(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from poise.jobs import practice
 from poise.jobs.practice import Watching, practise
-from poise.jobs.track.controllers import LOST, TRACKED, Merit
+from poise.jobs.result import LOST, TRACKED, Merit
 from poise.learn import Until
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from poise.control import ImplicitResidual
 from poise.env import rewards as reward
-from poise.jobs.inbetween.training import Inbetween
+from poise.jobs.inbetween.inbetween_training import Inbetween
 from poise.jobs.presets import NAMES, preset_of
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes import ResidualForce, build
 from poise.recipes.perpetual import build as build_perpetual
-from poise.recipes.perpetual_settings import Perpetual
 from poise.settings import from_data, to_data
 from refusals import refused
 from toy_human import swing
@@ -213,7 +213,7 @@ def test_the_presets_build_what_they_say() -> None:
     assert moving and all(r.kd == pytest.approx(0.2 * r.kp) for r in moving if r.order)
     code = build(swing(), ResidualForce.code(num_envs=2))
     assert next(t for t in code.task.rewards if t.fn is reward.pose).params["half"] is True
-    for config in (Perpetual.paper(num_envs=2), Perpetual.code(num_envs=2)):
+    for config in (StagedPerpetual.paper(num_envs=2), StagedPerpetual.code(num_envs=2)):
         phc = build_perpetual(swing(), config)
         energy = next(t for t in phc.task.rewards if t.fn is reward.energy)
         assert energy.params["form"] == config.energy_form
@@ -228,7 +228,7 @@ def test_the_presets_build_what_they_say() -> None:
 def test_presets_by_name() -> None:
     for recipe, default in (
         ("residual-force", ResidualForce()),
-        ("perpetual", Perpetual.additive()),
+        ("perpetual", StagedPerpetual.additive()),
         ("inbetween", None),
     ):
         for name in NAMES:

@@ -15,7 +15,7 @@ from poise.control import Stiffness
 from poise.env.pushes import OnePush, Push
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import TrackConfig, imitation_of, track, write
+from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.track.pushed import PushConfig, back_after, from_the_front, row_of, unforeseen, with_push
 from poise.jobs.tracker import Tracker
@@ -53,7 +53,7 @@ def test_a_walk_with_a_push(tracker: Tracker, tmp_path: Path) -> None:
     np.testing.assert_array_equal(a[:31], b[:31])
     assert np.abs(a[31:] - b[31:]).max() > 0.05
     # What is written: the goal that gave way is the report's ghost, the push its arrow.
-    paths = write(made, tmp_path / "out").paths
+    paths = made.write(tmp_path / "out").paths
     page = paths["report"].read_text()
     assert '"pushed":true' in page and ">goal<" in page and ">Push<" in page
     rows = made.evaluation.recordings[0].contacts

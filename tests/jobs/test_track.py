@@ -17,7 +17,7 @@ from poise.formats.point_fit import JOINT_PLACES
 from poise.formats.raw import ReadOptions as Options
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
-from poise.jobs.track import ResetOnFail, TrackConfig, imitation_of, look_ahead, track, write
+from poise.jobs.track import ResetOnFail, TrackConfig, imitation_of, look_ahead, track
 from poise.jobs.track.controllers import NO_CRITIC
 from poise.jobs.track.placement import home, place, points_of
 from poise.jobs.tracker import Tracker
@@ -99,7 +99,7 @@ def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> N
     assert failed == pytest.approx(first / 30.0)
     motion = tracked.motion()
     assert (motion.frames, motion.fps, motion.skeleton) == (40, 30.0, clip.skeleton)
-    done = write(tracked, tmp_path / "out", tmp_path / "out.bvh")
+    done = tracked.write(tmp_path / "out", tmp_path / "out.bvh")
     assert set(done.paths) == {"simulated", "score", "report", "simulation"}
     assert done.paths["simulated"].exists()
     assert json.loads((tmp_path / "out/score.json").read_text())["help"]["limit_n"] == 0.0
@@ -144,7 +144,7 @@ def test_what_is_delivered_is_as_high_as_its_source(tracker: Tracker, tmp_path: 
 def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) -> None:
     source = swing(0.5, 60.0, scale=1.1)
     tracked = track(source, tracker, controller="policy")
-    done = write(tracked, tmp_path, tmp_path / "out.npz", hold=False)
+    done = tracked.write(tmp_path, tmp_path / "out.npz", hold=False)
     assert set(done.paths) == {"simulated", "body", "score", "report", "simulation"}
     back, body = read_clip(done.paths["simulated"]), read_clip(done.paths["body"])
     assert back.skeleton.names == source.skeleton.names and back.frames == source.frames

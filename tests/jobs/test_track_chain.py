@@ -17,9 +17,9 @@ from poise.env import ImitationEnv, Reference
 from poise.env.recovery.recovering import RETURNS, TRACKS, Recovering
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import recovering, track, write
+from poise.jobs.track import recovering, track
 from poise.jobs.track.placement import home, place, place_all
-from poise.jobs.track.tracked import cut, parts_of
+from poise.jobs.track.recovering import cut, parts_of
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip, shifted, trim
 from poise.plan import LookaheadConfig
@@ -67,7 +67,7 @@ def test_two_walks_apart_are_one_motion(tracker: Tracker, tmp_path: Path) -> Non
     r = tracked.evaluation.rollouts
     own = (r.pos[0, begin : begin + 30] - r.ref_pos[0, begin : begin + 30]).norm(dim=-1).mean() * 1000
     assert card.per_clip[1]["mpjpe_global_mm"] == pytest.approx(float(own), rel=1e-4)
-    done = write(tracked, tmp_path / "out", tmp_path / "out.bvh")
+    done = tracked.write(tmp_path / "out", tmp_path / "out.bvh")
     assert set(done.paths) == {"simulated", "body", "score", "report"}
     made = read_clip(tmp_path / "out.bvh")
     assert made.frames == len(qpos) and made.skeleton.names == clips[0].skeleton.names

@@ -10,7 +10,7 @@ import torch
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track, write
+from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track
 from poise.jobs.track.placement import place
 from poise.jobs.track.supports import APART_M, crowd, places
 from poise.jobs.tracker import Tracker
@@ -118,7 +118,7 @@ def test_each_looks_ahead_in_copies_of_itself_alone(tracker: Tracker) -> None:
 def test_a_crowd_of_another_skeleton_is_delivered(tracker: Tracker, tmp_path: Path) -> None:
     source = swing(0.7, 30.0)
     tracked = track(source, tracker, TrackConfig(controller="policy", count=2, reset_on_fail=True))
-    done = write(tracked, tmp_path, hold=False)
+    done = tracked.write(tmp_path, hold=False)
     assert set(done.paths) == {
         "simulated_swing-1", "simulated_swing-2", "body_swing-1", "body_swing-2", "score", "report",
     }  # fmt: skip
@@ -129,7 +129,7 @@ def test_a_crowd_of_another_skeleton_is_delivered(tracker: Tracker, tmp_path: Pa
     # They begin side by side.
     assert (two.root_pos - one.root_pos)[0] == pytest.approx([0.0, APART_M, 0.0], abs=0.05)
     with refused("folder-needed", says="2"):
-        write(tracked, tmp_path, tmp_path / "one.bvh")
+        tracked.write(tmp_path, tmp_path / "one.bvh")
 
 
 def test_counts_that_make_no_sense() -> None:

@@ -13,7 +13,7 @@ from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.direction import Direction
-from poise.jobs.track.rates import with_travel
+from poise.jobs.track.in_place import with_travel
 from poise.jobs.track.simulation import Retake
 from poise.jobs.tracker import Tracker
 from poise.kinematics.directed import TouchPoint

@@ -14,7 +14,8 @@ from poise.cli.main import main
 from poise.formats import read_clip, write_clip
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
-from poise.jobs.track import Tracked, track, write
+from poise.jobs.result import Result
+from poise.jobs.track import track
 from poise.jobs.track.direction import Direction, Weight
 from poise.jobs.track.retaking import FADE_S, SETTLE_S, changed_s, eased, part_of
 from poise.jobs.track.simulation import FILE, Retake, Simulation, read_simulation, retake_of
@@ -40,7 +41,7 @@ def clip() -> Clip:
 
 
 @pytest.fixture(scope="module")
-def earlier(tracker: Tracker, clip: Clip) -> Tracked:
+def earlier(tracker: Tracker, clip: Clip) -> Result:
     return track(clip, tracker, **HOW)
 
 
@@ -75,7 +76,7 @@ def test_only_the_part_changes(tracker: Tracker, clip: Clip) -> None:
     np.testing.assert_array_equal(again.evaluation.recordings[0].qpos, qpos)
 
 
-def test_to_the_end_there_is_no_seam(tracker: Tracker, clip: Clip, earlier: Tracked) -> None:
+def test_to_the_end_there_is_no_seam(tracker: Tracker, clip: Clip, earlier: Result) -> None:
     assert earlier.simulation is not None
     made = track(clip, tracker, retake=Retake(earlier.simulation, 0.5, 99.0), seed=1, **HOW)
     assert any("to its end" in note for note in made.notes)
@@ -83,8 +84,8 @@ def test_to_the_end_there_is_no_seam(tracker: Tracker, clip: Clip, earlier: Trac
     assert torch.equal(made.simulation.qpos[:15], earlier.simulation.qpos[:15])
 
 
-def test_files_hold_what_is_needed(tracker: Tracker, clip: Clip, earlier: Tracked, tmp_path: Path):
-    paths = write(earlier, tmp_path / "out").paths
+def test_files_hold_what_is_needed(tracker: Tracker, clip: Clip, earlier: Result, tmp_path: Path):
+    paths = earlier.write(tmp_path / "out").paths
     assert paths["simulation"].name == FILE
     kept = read_simulation(tmp_path / "out")
     assert earlier.simulation is not None
@@ -98,7 +99,7 @@ def test_files_hold_what_is_needed(tracker: Tracker, clip: Clip, earlier: Tracke
     t = np.arange(clip.frames) / clip.fps
     beside = (t <= first) | (t >= last)
     assert 5 < beside.sum() < clip.frames
-    two = write(made, tmp_path / "two").paths["simulated"]
+    two = made.write(tmp_path / "two").paths["simulated"]
     written = [read_clip(p).positions() for p in (paths["simulated"], two)]
     np.testing.assert_allclose(written[1][beside], written[0][beside], atol=2e-6, rtol=0)
     assert np.abs(written[1][~beside] - written[0][~beside]).max() > 1e-4
@@ -112,15 +113,15 @@ def test_files_hold_what_is_needed(tracker: Tracker, clip: Clip, earlier: Tracke
     # Keyframes are completed anew in part, too.
     keys = (0, clip.frames // 2, clip.frames - 1)
     one = complete(clip, keys, tracker, adapt=0, **HOW)
-    assert one.tracked.simulation is not None
-    part = Retake(one.tracked.simulation, 0.3, 0.6)
+    assert one.simulation is not None
+    part = Retake(one.simulation, 0.3, 0.6)
     two = complete(clip, keys, tracker, adapt=0, retake=part, **HOW)
     assert any("simulated anew" in note for note in two.notes)
     with refused("settings-conflict"):
         complete(clip, keys, tracker, retime=True, retake=part, **HOW)
 
 
-def test_what_cannot_be_is_said(tracker: Tracker, clip: Clip, earlier: Tracked, tmp_path: Path) -> None:
+def test_what_cannot_be_is_said(tracker: Tracker, clip: Clip, earlier: Result, tmp_path: Path) -> None:
     kept = earlier.simulation
     assert kept is not None
     with refused("length-differs"):
@@ -146,7 +147,7 @@ def test_what_cannot_be_is_said(tracker: Tracker, clip: Clip, earlier: Tracked, 
     assert part_of(lost, Retake(lost, 0.2, 0.4)) == (6, kept.frames - 1)
 
 
-def test_damaged_files_are_refused(earlier: Tracked, tmp_path: Path) -> None:
+def test_damaged_files_are_refused(earlier: Result, tmp_path: Path) -> None:
     assert earlier.simulation is not None
     path = tmp_path / FILE
     earlier.simulation.save(path)

@@ -11,7 +11,7 @@ from support_motions import motion
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import TrackConfig, track, write
+from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.placement import place
 from poise.jobs.track.supports import at_home, on_body
 from poise.jobs.tracker import Tracker
@@ -46,7 +46,7 @@ def test_a_motion_that_sits_is_tracked_on_its_seat(tracker: Tracker, tmp_path: P
     # While it sits, more than a third of it stands on the seat, but for moments.
     on_seat = [rows[np.abs(rows[:, 2] - seat.top) < 0.05][:, 5].sum() for rows in touched[80:130]]
     assert np.mean(np.array(on_seat) > weight / 3) > 0.8 and np.median(on_seat) > weight / 2
-    paths = write(done, tmp_path).paths
+    paths = done.write(tmp_path).paths
     assert read_supports(paths["supports"]) == done.supports
     assert "seat1" in paths["scene"].read_bytes().decode("latin-1")
     again = read_clip(paths["scene"])
@@ -73,7 +73,7 @@ def test_a_stated_support_is_scaled_as_the_motion(tracker: Tracker):
 def test_what_makes_no_sense_is_refused(tracker: Tracker):
     seat = Support("seat", (0.4, 0.4, 0.4), (3.0, 1.0, 0.2))
     for settings in ({"recover": True}, {"count": 2}):
-        with refused("single-character-only", says="supports"):
+        with refused("single-character-only", says="support"):
             TrackConfig(supports=(seat,), **settings)
     with refused("single-clip-only", says="a support"):
         TrackConfig(supports=(seat,)).check(2)

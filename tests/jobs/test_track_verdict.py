@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from poise.jobs.result import shortfalls
 from poise.jobs.track import TrackConfig, rates
 from poise.jobs.track.rates import rate_doubts, rate_notes
-from poise.jobs.track.tracked import shortfalls
 from poise.kinematics.rate import RateJudgement, Reason
 from poise.score import Help, ScoreCard
 from toy_human import swing

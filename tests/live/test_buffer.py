@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from poise.live import quats as q
 from poise.live.stream import FADE_S, JitterBuffer, margin
+from poise.motion import quats as q
 
 STILL = np.array([[1.0, 0, 0, 0]])
 

@@ -22,8 +22,8 @@ from websockets.sync.client import connect
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live.commands import MOST_BYTES, LiveConfig
-from poise.live.page.server import HEAD, PAGES, PageServer, as_json, packed
+from poise.live.page.server import PAGES, PageServer
+from poise.live.protocol import HEAD, MOST_BYTES, LiveConfig, as_json, packed
 from poise.live.session import Session, SessionConfig
 from poise.live.sockets import A_SECOND, EACH, Guard
 from poise.live.stream import Inbox
@@ -205,7 +205,7 @@ def test_push_fall_recovery_and_record_in_chromium(tmp_path: Path) -> None:
     wanted = SessionConfig({"walk": read_clip(WALK)}, record=tmp_path / "take.bvh")
     session = Session(open_run(None).tracker, LiveConfig(), wanted)
     done = threading.Event()
-    steps = threading.Thread(target=lambda: session.live.run(done.is_set))
+    steps = threading.Thread(target=lambda: session.live.run(done.is_set, session.shows))
     steps.start()
     try:
         with opened(session.server.url, tmp_path / "profile") as page:

@@ -18,16 +18,16 @@ from poise.env.stream import StreamGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.live import quats as q
+from poise.kinematics.retarget.passage import world_of
 from poise.live.characters import TRACKS
-from poise.live.commands import LiveConfig
-from poise.live.passage import world_of
 from poise.live.points import PointFit
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live
 from poise.live.sockets import StreamDoor
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
+from poise.motion import quats as q
 from test_docs import ROOT, WALK
 
 STEP = 1 / 30
@@ -110,7 +110,7 @@ def test_a_character_follows_keypoints_of_a_stream(tracker: Tracker, walk: Clip)
     live, tracked = Live(tracker, LiveConfig(), clock=lambda: 0.0), 0
     fit = PointFit(live.inbox, tracker.example, tracker.humanoid.table)
     fit.offer = fit.fit  # type: ignore[method-assign]
-    stream = JsonStream(live.inbox, "", fit)
+    stream = JsonStream(live.inbox, "", fit.offer)
     for now, points in film(walk, 30.0, 3.5):
         told = {"v": 1, "type": "keypoints", "person": "a", "time": now}
         if now == 0.0:
@@ -141,7 +141,7 @@ def test_a_character_follows_keypoints_of_a_stream(tracker: Tracker, walk: Clip)
     ],
 )
 def test_what_is_no_keypoints_is_refused(tracker: Tracker, message: dict, why: str) -> None:
-    stream = JsonStream(Inbox(), "", fitted(tracker))
+    stream = JsonStream(Inbox(), "", fitted(tracker).offer)
     assert stream.receive(json.dumps({"v": 1, "type": "keypoints", **message}), 0.0) == why
     alone = JsonStream(Inbox())
     assert alone.receive('{"v": 1, "type": "keypoints"}', 0.0) == "no keypoints here"
@@ -153,7 +153,7 @@ class Door:
     def __init__(self, tracker: Tracker, token: str | None = None):
         self.fit, self.frames = fitted(tracker), list[KeypointFrame]()
         self.fit.offer = self.frames.append  # type: ignore[method-assign]
-        self.door = StreamDoor("127.0.0.1", 0, self.fit.inbox, self.fit, time.perf_counter, token)
+        self.door = StreamDoor("127.0.0.1", 0, self.fit.inbox, self.fit.offer, time.perf_counter, token)
         self.door.start()
 
     def until(self, frames: int) -> None:
@@ -274,9 +274,9 @@ def test_a_policy_of_keypoints_is_told_the_points_and_another_one_the_fit(walk: 
             assert np.allclose(packet.rot, line[-1][1].rot, atol=1e-6)
             live.inbox.offer(packet, now)
             last = packet.places
-        live.step(now)
+        seen = live.step(now)
         person, goal = live.people.of(0), live.world.goal
-        if live.aims.own(0) is None or person is None or person.onto is None or last is None:
+        if seen is None or seen.own[0] is None or person is None or person.onto is None or last is None:
             continue
         newest = goal.layout.unpacked(goal.packs[:, int(goal.count[0] - 1) % goal.size])
         pose = person.read(now + STEP)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from poise.live.commands import COMMANDS, command, parse
-from poise.live.page.server import as_json
+from poise.live.protocol import COMMANDS, as_json, command, parse
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox
 from test_docs import ROOT
@@ -38,7 +37,7 @@ class Kept:
 
 def test_every_message_of_the_page_is_taken() -> None:
     inbox, kept = Inbox(), Kept()
-    stream, seen = JsonStream(inbox, "", kept), set[str]()
+    stream, seen = JsonStream(inbox, "", kept.offer), set[str]()
     for message in messages():
         kind, text = message["type"], json.dumps(message)
         seen.add(kind)
@@ -59,7 +58,7 @@ def test_commands_and_reasons_are_all_on_the_page() -> None:
     for kind, fields in COMMANDS.items():
         assert f"`{kind}`" in PAGE, kind
         assert all(f"`{name}`" in PAGE for name in fields), kind
-    rooms = ("commands.py", "stream.py", "points.py", "sources.py", "sockets.py")
+    rooms = ("protocol.py", "stream.py", "points.py", "sources.py", "sockets.py")
     for room in rooms:
         text = (ROOT / "src/poise/live" / room).read_text(encoding="utf-8")
         said = re.findall(r'(?:PoiseError\(|refuse\(|return )"([a-z][a-zA-Z -]+)"', text)

@@ -15,7 +15,7 @@ import pytest
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.kinematics import clip_to_qpos
-from poise.live.record import CharacterRecorder
+from poise.live.sinks import CharacterRecorder
 from refusals import refused
 
 

@@ -8,15 +8,15 @@ import pytest
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
+from poise.kinematics.retarget.passage import world_of
 from poise.kinematics.stream_noise import LATE_S
-from poise.live import quats as q
-from poise.live.passage import world_of
 from poise.live.people import Person, Steady
 from poise.live.points import PointFit
 from poise.live.session import _of_tremble
 from poise.live.sources import KeypointFrame, Loop
 from poise.live.stream import Inbox, JitterBuffer, Packet, StreamTremble, margin
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 from test_docs import WALK
 
 STEP = 1 / 30

@@ -11,20 +11,17 @@ import pytest
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live import quats as q
-from poise.live.commands import LiveConfig
-from poise.live.passage import world_of
+from poise.kinematics.retarget.passage import world_of
 from poise.live.people import Calibration
+from poise.live.protocol import LiveConfig
 from poise.live.session import Live
+from poise.live.sinks import OwnPuppet, Puppet, VmcSink
 from poise.live.stream import Inbox
 from poise.live.vmc import (
     MESSAGES,
     NEEDED,
     Avatar,
     Message,
-    OwnPuppet,
-    Puppet,
-    VmcSink,
     VmcSource,
     bundled,
     datagram,
@@ -37,6 +34,7 @@ from poise.live.vmc import (
     to_unity,
 )
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 from refusals import refused
 from test_docs import WALK
 
@@ -180,7 +178,7 @@ def test_in_through_the_body_and_out_agree_to_a_millimetre_on_the_wire() -> None
         seen = live.step(now)
         now += 1 / 30
         assert seen is not None
-        own = live.aims.own(0)
+        own = seen.own[0]
         if own is None:
             continue
         seen_once += 1

@@ -19,10 +19,10 @@ from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.kinematics import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary, resample
+from poise.recipes.body_shapes import GROUPS, BodyShapes, scaled_skeleton, scaled_table, shaped
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build, task
 from poise.recipes.perpetual_settings import Perpetual
-from poise.recipes.shapes import GROUPS, BodyShapes, scaled_skeleton, scaled_table, shaped
 from poise.sim import CpuBackend, alone
 from refusals import refused
 from toy_library import library, tiny

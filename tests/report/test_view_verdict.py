@@ -8,7 +8,7 @@ import pytest
 from fake_report import make_report, score
 
 from poise.score.report.page import amount, render, score_rows
-from poise.score.report.verdict import THRESHOLDS, grades, help_given, overall, percent, sentence
+from poise.score.report.verdict import grades, help_given, overall, percent, sentence
 
 
 def test_sentence_of_a_good_run():
@@ -60,13 +60,6 @@ def test_thresholds_are_stated_beside_the_figures():
         "good from 95, fair from 80 %",
         "good to 40, fair to 80 mm",
     ]
-
-
-def test_thresholds_are_those_of_the_score_card():
-    verdicts = pytest.importorskip("poise.score.card")
-    for key, bounds in THRESHOLDS.items():
-        card = verdicts.THRESHOLDS[key]
-        assert (card.good, card.fair) == bounds, key
 
 
 def test_per_cent_never_rounds_to_all_or_nothing():

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from poise.jobs.inbetween.fill import inbetween
+from poise.kinematics.feet import off_floor
 from poise.motion import Clip
 from poise.motion.rotations import forward_kinematics
-from poise.synthesis.limits import ALOFT_M, fall_s, flight_speeds, flown, off_floor
+from poise.synthesis.limits import ALOFT_M, fall_s, flight_speeds, flown
 from toy_human import swing
 
 FPS = 30.0

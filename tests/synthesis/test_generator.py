@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from poise.env.generator import GeneratorGoal
+from poise.jobs.endless.endless_training import Endless, balanced, motions_of, train_generator
 from poise.jobs.endless.model import GeneratorModel, Motions, load_generator
-from poise.jobs.endless.training import Endless, balanced, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint

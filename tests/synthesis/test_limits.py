@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from poise.jobs.inbetween.fill import inbetween
+from poise.kinematics.feet import off_floor
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul
-from poise.synthesis.limits import calmed, excess, fastest, off_floor, spread
+from poise.synthesis.limits import calmed, excess, fastest, spread
 from toy_human import human, swing, turn
 
 FPS = 30.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from poise.kinematics.steps import lock_feet
 from poise.motion import Skeleton
 from poise.motion.rotations import (
     axis_angle_to_quat,
@@ -16,7 +17,6 @@ from poise.motion.rotations import (
 )
 from poise.motion.windows import foot_joints
 from poise.synthesis.filler import check_keyframes, split_gaps
-from poise.synthesis.footsteps import lock_feet
 from poise.synthesis.limits import fade, meet, sampled
 from refusals import refused
 from toy_human import swing, turn

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, table
-from poise.cli.options import Body, Flag, Reading
+from poise.cli.options import Body, Force, Json, Reading
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 
@@ -19,40 +17,36 @@ if TYPE_CHECKING:
     from poise.motion import Clip
 
 
-@dataclass(frozen=True)
-class Options:
-    """Show the body that is made for a clip: masses, hinges, gains, torque limits."""
+def run(
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")],
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.xml", help_behavior_hint="")] = None,
+    force: Force = False,
+    json: Json = False,
+    body: OmitArgPrefixes[Body] = Body(),
+    reading: OmitArgPrefixes[Reading] = Reading(),
+) -> Answer:
+    """Show the body that is made for a clip: masses, hinges, gains, torque limits.
 
-    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
-    """The motion file."""
-    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.xml", help_behavior_hint="")] = None
-    """Write the body as MJCF, which MuJoCo loads: on a floor, with its servos, as it is simulated."""
-    force: Flag = False
-    """Write over a file that is there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    body: OmitArgPrefixes[Body] = field(default_factory=Body)
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
-
-
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Fits the body as training would, so that the table is the one that is trained."""
-    config, out = options.body.config(), options.out
+    Args:
+        clip: the motion file.
+        out: write the body as MJCF, which MuJoCo loads: on a floor, with its servos, as it is simulated.
+    """
+    config = body.config()
     if out is not None:
         if out.suffix.lower() != ".xml":
             raise PoiseError(
                 "a body is written as MJCF, in a file .xml", out, "Give -o FILE.xml", code="wrong-suffix"
             )
-        own = () if options.body.body is None else (options.body.body,)
-        may_write(out, options.force, options.clip, *own)
+        own = () if body.body is None else (body.body,)
+        may_write(out, force, clip, *own)
     from poise.kinematics import fit_humanoid
     from poise.sim.mjcf import write_mjcf
 
-    clip = options.reading.read(options.clip)
-    humanoid, _, report = fit_humanoid(clip, config)
+    motion = reading.read(clip)
+    humanoid, _, report = fit_humanoid(motion, config)
     rows = humanoid.table.describe()
     title = (
-        f"{options.clip.name}: {len(rows)} bodies, {len(humanoid.hinges)} hinges, "
+        f"{motion.name}: {len(rows)} bodies, {len(humanoid.hinges)} hinges, "
         f"{humanoid.mass:.1f} kg, {humanoid.table.height_m:.2f} m"
     )
     columns = ("body", "part", "parent", "hinges", "shape", "kg", "kp", "kd", "N m", "range, degrees")
@@ -61,7 +55,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     facts |= {"hinges": len(humanoid.hinges), "bodies": rows}
     outputs = {} if out is None else {"body": write_mjcf(humanoid, out)}
     return Answer(
-        facts, outputs, [*clip.skeleton.source.notes, *_made(clip, config), *report.sentences()]
+        facts, outputs, [*motion.skeleton.source.notes, *_made(motion, config), *report.sentences()]
     )
 
 

@@ -6,23 +6,41 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.console import LOST, Answer, print_card, say, table, tell
 from poise.cli.inbetween import frames_of
-from poise.cli.options import Flag, InPlace, Reading, check_range, places
+from poise.cli.options import (
+    Directing,
+    Flag,
+    Force,
+    HoldFeet,
+    Json,
+    Out,
+    PolicyFile,
+    Reading,
+    check_range,
+    places,
+)
+from poise.cli.settings import TRACK, derived, given
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
-    from poise.jobs.complete import Completed
+    from poise.jobs.result import Result
     from poise.motion import Clip
 
 #: s outside the keyframes that are worth a sentence.
 LONG_S = 5.0
+
+
+if TYPE_CHECKING:
+    Tracking: TypeAlias = Any
+else:
+    Tracking = derived(TRACK, "", "controller", "seed", "threads", "in_place")
 
 
 @dataclass(frozen=True)
@@ -35,9 +53,7 @@ class Options:
     keyframes: Annotated[str, arg(metavar="0,30,60")]
     """Frames that stay, counted from 0, in rising order; frames outside of them stay too. Or all, with
     --times: each frame of the file is a pose."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
-    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
-    into a folder of its name."""
+    out: Out
     times: Annotated[str | None, arg(metavar="0,1.2,2.5", help_behavior_hint="")] = None
     """Times of the keyframes, in s from the first; by default they stay where they are in the file.
     They may be rough: see --retime."""
@@ -47,41 +63,17 @@ class Options:
     """Only fill the frames, without a body: keyframes are met exactly. See poise inbetween."""
     retime: Flag = False
     """Give gaps that no body does in their time more of it; the new times are said."""
-    policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
-    along and is told places alone; by default the one for rotations that comes with Poise."""
+    policy: PolicyFile = None
     model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """A trained in-betweening network; by default the one that comes with Poise."""
-    controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
-    """See poise track."""
-    budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
-    """Simulated control steps of lookahead for each that is made; by default 768."""
-    weight: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PART=FACTOR[:A-B]")] = ()
-    """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
-    pin: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:A-B")] = ()
-    """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
-    touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
-    """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
-    span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
-    """Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
-    earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
-    """The folder of an earlier result of the same motion, for --range."""
     adapt: Annotated[int, arg(metavar="N")] = 20
     """Iterations of test-time adaptation for each gap; 0 does without."""
-    seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of all draws."""
-    threads: Annotated[int, arg(metavar="N")] = 0
-    """Cores for lookahead and search; 0 is all."""
-    in_place: InPlace = "auto"
-    """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
-    place again; travel writes it with its travel; keep simulates it as it is."""
-    hold_feet: Flag = True
-    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+    hold_feet: HoldFeet = True
+    force: Force = False
+    json: Json = False
+    tracking: OmitArgPrefixes[Tracking] = field(default_factory=Tracking)
+    directing: OmitArgPrefixes[Directing] = Directing()
+    reading: OmitArgPrefixes[Reading] = Reading()
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
@@ -96,9 +88,6 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         )
     keys = () if every else frames_of(o.keyframes)
     check_range("adapt", o.adapt, 0, 1000)
-    check_range("seed", o.seed, 0)
-    check_range("threads", o.threads, 0)
-    check_range("budget", o.budget, 1, 1_000_000)
     if o.kinematic:
         return _kinematic(o, keys)
     out, motion = places(o.out)
@@ -106,20 +95,12 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.cli.track import telling
     from poise.jobs.complete import complete
     from poise.jobs.open import open_run
-    from poise.jobs.track import TrackConfig
-    from poise.jobs.track.direction import direction_of
-    from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.tracked import story
-    from poise.plan import LookaheadConfig
+    from poise.jobs.result import story
+    from poise.jobs.track_settings import TrackConfig
     from poise.synthesis.filler import check_keyframes
     from poise.synthesis.inbetween import partials_of, times_of
 
-    ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
-    config = TrackConfig(
-        seed=o.seed, controller=o.controller, lookahead=ahead, threads=o.threads,
-        direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
-        in_place=o.in_place,
-    )  # fmt: skip
+    config = TrackConfig(**given(o.tracking), **o.directing.values())
     times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)
     keys = tuple(range(clip.frames)) if every else keys
@@ -139,11 +120,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     _say(done)
     print_card(delivered.card)
     say(done.sentence)
-    became = story(done.tracked, hint=False)
+    became = story(done, hint=False)
     word = became.word if became.failed else "completed"
     result = {
         "outcome": word,
-        "controller": done.tracked.controller,
+        "controller": done.controller,
         "sentence": done.sentence,
         "keyframes": list(done.keyframes),
         "at": list(done.at),
@@ -170,7 +151,7 @@ def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
-    if o.partial or o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
+    if o.partial or o.retime or given(o.directing):
         raise PoiseError(
             "--kinematic has no body to direct or to wait for",
             hint="Leave it out",
@@ -192,7 +173,12 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     with contextlib.ExitStack() as shown:
         bar = staged(shown)
         filled = inbetween(
-            clip, keys, o.model, adapt=o.adapt, seed=o.seed, on_gap=lambda n, of: bar("filling", n, of)
+            clip,
+            keys,
+            o.model,
+            adapt=o.adapt,
+            seed=o.tracking.seed or 0,
+            on_gap=lambda n, of: bar("filling", n, of),
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_clip(filled.clip, path)
@@ -201,12 +187,12 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     )
     result = {
         "outcome": "filled", "keyframes": list(asked), "at": list(keys),
-        "warnings": list(filled.warnings), "faults": [f.to_dict() for f in filled.faults],
+        "warnings": list(filled.filled.warnings), "faults": [f.to_dict() for f in filled.filled.faults],
     }  # fmt: skip
     return Answer(result, {"motion": path}, filled.notes, outcome="filled")
 
 
-def _say(done: Completed) -> None:
+def _say(done: Result) -> None:
     """The stages as a table."""
 
     def figure(value: float | None, digits: int = 0) -> str:

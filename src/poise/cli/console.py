@@ -179,7 +179,7 @@ def inputs_of(options: Any) -> list[Path]:
     """The files and folders that the options of a verb name as its input."""
     found: list[Path] = []
     for name in _INPUTS:
-        value = getattr(options, name, None)
+        value = options.get(name) if isinstance(options, Mapping) else getattr(options, name, None)
         # `train` holds its library in a group of options of that name.
         value = getattr(value, "library", value)
         found += value if isinstance(value, tuple) else [value] if value is not None else []

@@ -2,71 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, say
-from poise.cli.options import Flag, Reading, each
+from poise.cli.options import Force, Json, Reading, each
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_write
 
 
-@dataclass(frozen=True)
-class Options:
-    """Write a motion file in another format or at another frame rate, or a part of it."""
+def run(
+    source: Annotated[Positional[Path], arg(metavar="IN")],
+    target: Annotated[Positional[Path | None], arg(metavar="OUT", help_behavior_hint="")] = None,
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None,
+    resample: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None,
+    frames: Annotated[str | None, arg(metavar="A-B", help_behavior_hint="")] = None,
+    to: Annotated[str, arg(metavar="FORMAT")] = "bvh",
+    force: Force = False,
+    json: Json = False,
+    reading: OmitArgPrefixes[Reading] = Reading(),
+) -> Answer:
+    """Write a motion file in another format or at another frame rate, or a part of it.
 
-    source: Annotated[Positional[Path], arg(metavar="IN")]
-    """The motion file to read, or a folder of such files."""
-    target: Annotated[Positional[Path | None], arg(metavar="OUT", help_behavior_hint="")] = None
-    """The motion file to write; its suffix names the format (.bvh). For a folder the folder to write."""
-    out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """The same as OUT."""
-    resample: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None
-    """Frames per second of the result."""
-    frames: Annotated[str | None, arg(metavar="A-B", help_behavior_hint="")] = None
-    """Only the frames from A to B, both of them, counted from 0 as they are read."""
-    to: Annotated[str, arg(metavar="FORMAT")] = "bvh"
-    """The format of the files that are made of a folder: bvh, glb, npz, ..."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
-
-
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Reads, resamples where asked to, writes."""
+    Args:
+        source: the motion file to read, or a folder of such files.
+        target: the motion file to write; its suffix names the format (.bvh). For a folder the folder to
+            write.
+        out: the same as OUT.
+        resample: frames per second of the result.
+        frames: only the frames from A to B, both of them, counted from 0 as they are read.
+        to: the format of the files that are made of a folder: bvh, glb, npz, ...
+    """
     from poise.formats import check_writable, write_clip
-    from poise.motion import resample, trim
+    from poise.motion import resample as resampled
+    from poise.motion import trim
 
-    target = target_of(options)
-    if options.source.is_dir():
-        to = "." + options.to.lstrip(".")
-        check_writable(Path(f"OUT{to}"))
+    into = target_of(target, out)
+    if source.is_dir():
+        suffix = "." + to.lstrip(".")
+        check_writable(Path(f"OUT{suffix}"))
 
         def one(path: Path, name: str) -> Answer:
-            into = target / f"{name}{to}"
-            into.parent.mkdir(parents=True, exist_ok=True)
-            return run(replace(options, source=path, target=into, out=None), argv)
+            file = into / f"{name}{suffix}"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            return run(path, file, None, resample, frames, to, force, json, reading)
 
-        with claimed(target):
-            return each("convert", (options.source,), target, one)
-    may_write(target, options.force, options.source)
-    clip = options.reading.read(options.source)
-    if options.frames is not None:
-        first, last = _span(options.frames, clip.frames, options.source)
+        with claimed(into):
+            return each("convert", (source,), into, one)
+    may_write(into, force, source)
+    clip = reading.read(source)
+    if frames is not None:
+        first, last = _span(frames, clip.frames, source)
         clip = trim(clip, first, last + 1)
-    if options.resample is not None:
-        clip = resample(clip, options.resample)
-    write_clip(clip, target)
+    if resample is not None:
+        clip = resampled(clip, resample)
+    write_clip(clip, into)
     say(f"{clip.frames} frames at {clip.fps:.5g} fps, {clip.seconds:.2f} s")
     figures = {"frames": clip.frames, "fps": clip.fps, "seconds": clip.seconds}
     notes, outcome = clip.skeleton.source.notes, f"{clip.frames} frames"
-    return Answer(figures, {"clip": target}, notes, outcome=outcome)
+    return Answer(figures, {"clip": into}, notes, outcome=outcome)
 
 
 def _span(words: str, frames: int, where: Path) -> tuple[int, int]:
@@ -83,9 +79,9 @@ def _span(words: str, frames: int, where: Path) -> tuple[int, int]:
     return first, last
 
 
-def target_of(options: Options) -> Path:
+def target_of(target: Path | None, out: Path | None) -> Path:
     """OUT, which may be given by its place or with -o."""
-    given = [x for x in (options.target, options.out) if x is not None]
+    given = [x for x in (target, out) if x is not None]
     if len(given) != 1:
         what = "OUT is given twice" if given else "poise convert needs OUT"
         raise PoiseError(

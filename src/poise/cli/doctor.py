@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +21,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise import __version__
 from poise.cli.console import Answer, notes, out, say, table
-from poise.cli.options import Flag, Reading, each
+from poise.cli.options import Flag, Force, Json, Reading, each
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_write
 from poise.machine import cores
@@ -62,11 +62,9 @@ class Options:
     motion stays; without --fix nothing else is changed."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """The mended motion on the same skeleton; its suffix names the format. For a folder a folder."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+    force: Force = False
+    json: Json = False
+    reading: OmitArgPrefixes[Reading] = Reading()
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from poise.cli.console import INTERRUPTED, Answer, say, table, tell
-from poise.cli.options import Flag, clips_in
+from poise.cli.options import Json, clips_in
 from poise.cli.parse import parse
 from poise.cli.training import clock
 from poise.errors import PoiseError
@@ -57,8 +57,7 @@ class Options:
     """Run on a Ray cluster: HOST:PORT, ray://HOST:PORT, auto or local. Its machines must see the
     same files. By default the jobs run on this machine, without Ray."""
 
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
+    json: Json = False
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:

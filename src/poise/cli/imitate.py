@@ -5,12 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import LOST, Answer, launched, print_card, say, tell
-from poise.cli.options import Body, Chosen, Flag, InPlace, Reading, Training, places, printed
+from poise.cli.options import (
+    Body,
+    Chosen,
+    Force,
+    HoldFeet,
+    InPlaceMode,
+    Json,
+    Out,
+    Reading,
+    Training,
+    places,
+    printed,
+)
 from poise.cli.settings import given
 from poise.cli.track import follow
 from poise.cli.training import Shown, beginning, clock, command_line, left, stopped, summary
@@ -18,8 +30,9 @@ from poise.errors import PoiseError
 from poise.jobs.keep import may_deliver
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.stage_order import Progress
-    from poise.jobs.track import TrackConfig, Tracked
+    from poise.jobs.perpetual.stages import Progress
+    from poise.jobs.result import Result
+    from poise.jobs.track import TrackConfig
     from poise.jobs.tracker import Tracker
     from poise.learn import PolicyBundle, WarmStart
     from poise.motion import Clip
@@ -38,28 +51,20 @@ class Options:
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
-    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
-    into a folder of its name."""
+    out: Out
     going_on: Annotated[str | None, arg(name="from", metavar="POLICY|none", help_behavior_hint="")] = (
         None
     )
     """The policy that begins, a file or a run; by default the one that comes with Poise. none trains
     from nothing."""
-    in_place: InPlace = "auto"
-    """A clip that walks in place is learned with the travel that its feet tell. auto writes it in place
-    again, a loop as a loop; travel writes it with its travel; keep takes it as it is. What is learned
-    from nothing is written with its travel."""
-    hold_feet: Flag = True
-    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    in_place: InPlaceMode = "auto"
+    hold_feet: HoldFeet = True
+    force: Force = False
+    json: Json = False
+    training: OmitArgPrefixes[Training] = Training()
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
-    body: OmitArgPrefixes[Body] = field(default_factory=Body)
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+    body: OmitArgPrefixes[Body] = Body()
+    reading: OmitArgPrefixes[Reading] = Reading()
 
 
 #: Where no policy begins.
@@ -118,52 +123,53 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     may_deliver(out, motion, o.force or held, o.clip)
     nothing, t = from_nothing(o, run), o.training
     from poise.jobs.imitate import Job
-    from poise.jobs.track.tracked import story
+    from poise.jobs.practice import Watching
+    from poise.jobs.result import story
 
     with Shown((o.clip,), o.reading, t, run, out) as shown:
-        told = shown.watching(
-            follow=lambda *how: tracks(shown, *how),
-            first=lambda first: first_result(first, out, motion, o.hold_feet),
-            unfit=unfit,
-            iteration=lambda p: practised(shown, p),
-            beginning=lambda task: beginning(first_delivery(task, out, motion, o.hold_feet)),
-        )
+        mine: dict[str, Any] = {
+            "follow": lambda *how: tracks(shown, *how),
+            "first": lambda first: first_result(first, out, motion, o.hold_feet),
+            "unfit": unfit,
+            "iteration": lambda p: practised(shown, p),
+            "beginning": lambda task: beginning(first_delivery(task, out, motion, o.hold_feet)),
+        }
+        told = Watching(**(shown.callbacks | mine))
         how = (t.threads, t.device, o.in_place, told, True)
         try:
             made = Job(shown.read, run, config, t.until(), *how).done(o.going_on, nothing)
             if made is None:
                 return Answer()
             with shown.doing("writing"):
-                done = made.deliver(out, motion, o.hold_feet)
+                done = made.write(out, motion, o.hold_feet)
         except KeyboardInterrupt:
             return stopped(run, again, shown.where)
     print_card(done.card)
     answer = Answer(done.card.to_dict(), {**done.paths, "run": run}, done.notes)
-    if made.tracked is None:
+    if made.placed is None:
         return answer
-    became, doubts = story(made.tracked, hint=False), made.tracked.doubts
+    became, doubts = story(made, hint=False), made.doubts
     for sentence in (*(doubts if became.failed else ()), became.sentence, *made.sentences):
         say(sentence)
     if became.failed or done.card.help.force_mean_n:
         say(f"Go on with --resume and --minutes {2 * t.minutes:g}.")
-    answer.notes, answer.outcome = (*made.tracked.notes, *done.notes), became.word
+    answer.notes, answer.outcome = (*made.notes, *done.notes), became.word
     if became.failed:
         answer.exit_code, answer.said = LOST, doubts
     return answer
 
 
-def tracks(shown: Shown, policy: Tracker, clip: Clip, config: TrackConfig) -> Tracked:
+def tracks(shown: Shown, policy: Tracker, clip: Clip, config: TrackConfig) -> Result:
     """Tracks, with bars of its own."""
     shown.close()
     return follow(policy, [clip], config, [])
 
 
-def first_result(first: Tracked, out: Path, motion: Path | None, hold: bool) -> None:
+def first_result(first: Result, out: Path, motion: Path | None, hold: bool) -> None:
     """Writes what is done before anything is learned, and says so."""
-    from poise.jobs.track import write
-    from poise.jobs.track.tracked import story
+    from poise.jobs.result import story
 
-    done = write(first, out, motion, hold)
+    done = first.write(out, motion, hold)
     tell(f"First result: {story(first, hint=False).sentence} See {done.paths['report']}")
 
 
@@ -173,13 +179,13 @@ def first_delivery(
     """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
 
     def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
-        from poise.jobs.deliver import deliver
+        from poise.jobs.result import Result
         from poise.jobs.runs import evaluate
         from poise.jobs.warm_start import FIRST_STARTS
 
         meta = {"seconds": start.seconds, "samples": start.samples}
         evaluation = evaluate(task, policy, meta, most=FIRST_STARTS)
-        paths = deliver(task, evaluation, out, {}, motion, hold).paths
+        paths = Result(task, evaluation).write(out, motion, hold).paths
         tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
 
     return deliver_first

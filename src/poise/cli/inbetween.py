@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, say, tell
-from poise.cli.options import Flag, Reading, check_range
+from poise.cli.options import Flag, Force, Json, Reading, check_range
 from poise.cli.training import left, showing
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
@@ -20,56 +19,52 @@ if TYPE_CHECKING:
     from poise.motion import Clip
 
 
-@dataclass(frozen=True)
-class Options:
-    """Make everything between keyframes of a clip anew; keyframes and all other frames stay."""
+def run(
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")],
+    keyframes: Annotated[str, arg(metavar="0,30,45")],
+    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")],
+    model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
+    samples: Annotated[int, arg(metavar="N")] = 1,
+    foot_lock: Flag = True,
+    adapt: Annotated[int, arg(metavar="N")] = 20,
+    seed: Annotated[int, arg(metavar="S")] = 0,
+    picture: Annotated[Path | None, arg(metavar="FILE.svg", help_behavior_hint="")] = None,
+    force: Force = False,
+    json: Json = False,
+    reading: OmitArgPrefixes[Reading] = Reading(),
+) -> Answer:
+    """Make everything between keyframes of a clip anew; keyframes and all other frames stay.
 
-    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
-    """The motion file that holds the keyframes."""
-    keyframes: Annotated[str, arg(metavar="0,30,45")]
-    """Frames that stay, counted from 0, in rising order; frames outside of them stay too."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
-    """The motion file to write; its suffix names the format (.bvh)."""
-    model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """A trained network: a run folder of poise train inbetween, or a model file; by default the one that
-    comes with Poise."""
-    samples: Annotated[int, arg(metavar="N")] = 1
-    """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others take another way."""
-    foot_lock: Flag = True
-    """Leave feet as the network made them; by default standing feet are held, and step clear of the
-    floor."""
-    adapt: Annotated[int, arg(metavar="N")] = 20
-    """Iterations of test-time adaptation for each gap, about a second in all: its feet slide less.
-    0 does without."""
-    seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of the variants."""
-    picture: Annotated[Path | None, arg(metavar="FILE.svg", help_behavior_hint="")] = None
-    """Also draw the poses, keyframes black, over the clip that came in."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
-
-
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Reads, fills, writes."""
+    Args:
+        clip: the motion file that holds the keyframes.
+        keyframes: frames that stay, counted from 0, in rising order; frames outside of them stay too.
+        out: the motion file to write; its suffix names the format (.bvh).
+        model: a trained network: a run folder of poise train inbetween, or a model file; by default the
+            one that comes with Poise.
+        samples: clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others take another
+            way.
+        foot_lock: leave feet as the network made them; by default standing feet are held, and step clear
+            of the floor.
+        adapt: iterations of test-time adaptation for each gap, about a second in all: its feet slide
+            less. 0 does without.
+        seed: seed of the variants.
+        picture: also draw the poses, keyframes black, over the clip that came in.
+    """
     from poise.formats import check_writable, write_clip
     from poise.jobs.inbetween.fill import inbetween
     from poise.synthesis.filler import check_keyframes
 
-    o = options
-    keys = frames_of(o.keyframes)
-    if not 0 <= o.adapt <= 1000:
-        raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}", code="out-of-range")
-    check_range("samples", o.samples, 1, 100)
-    one = o.samples == 1
-    outs = [o.out] if one else [o.out.with_stem(f"{o.out.stem}-{k}") for k in range(o.samples)]
+    keys = frames_of(keyframes)
+    if not 0 <= adapt <= 1000:
+        raise PoiseError(f"--adapt must be 0 to 1000, got {adapt}", code="out-of-range")
+    check_range("samples", samples, 1, 100)
+    one = samples == 1
+    outs = [out] if one else [out.with_stem(f"{out.stem}-{k}") for k in range(samples)]
     check_writable(outs[0])
-    for path in (*outs, *((o.picture,) if o.picture else ())):
-        may_write(path, o.force, o.clip)
-    clip = o.reading.read(o.clip)
-    check_keyframes(keys, clip.frames, str(o.clip))
+    for path in (*outs, *((picture,) if picture else ())):
+        may_write(path, force, clip)
+    source = reading.read(clip)
+    check_keyframes(keys, source.frames, str(clip))
     begun = time.monotonic()
     tell(f"filling {len(keys) - 1} gaps", "dim")
     with showing("filling", at_once=False) as show:
@@ -80,23 +75,24 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             show(done / of, f"gap {done} of {of}, {how}")
 
         filled = inbetween(
-            clip, keys, o.model, samples=o.samples, foot_lock=o.foot_lock, adapt=o.adapt, seed=o.seed,
+            source, keys, model, samples=samples, foot_lock=foot_lock, adapt=adapt, seed=seed,
             on_gap=count,
         )  # fmt: skip
-    for warning in filled.warnings:
+    for warning in filled.filled.warnings:
         tell(f"warning: {warning}.", "yellow")
     outputs = {"clip" if one else f"clip-{k}": path for k, path in enumerate(outs)}
     for made, path in zip(filled.clips, outs, strict=True):
         write_clip(made, path)
-        say(f"{path.name}: {made.frames} frames at {made.fps:.5g} fps, keyframes {o.keyframes}")
-    if o.picture is not None:
-        draw(clip, filled.clips, keys, o.picture)
-        outputs["picture"] = o.picture
+        say(f"{path.name}: {made.frames} frames at {made.fps:.5g} fps, keyframes {keyframes}")
+    if picture is not None:
+        draw(source, filled.clips, keys, picture)
+        outputs["picture"] = picture
     result = {
-        "frames": clip.frames, "fps": clip.fps, "keyframes": keys, "warnings": filled.warnings,
-        "faults": [f.to_dict() for f in filled.faults],
+        "frames": source.frames, "fps": source.fps, "keyframes": keys,
+        "warnings": filled.filled.warnings,
+        "faults": [f.to_dict() for f in filled.filled.faults],
     }  # fmt: skip
-    return Answer(result, outputs, clip.skeleton.source.notes)
+    return Answer(result, outputs, source.skeleton.source.notes)
 
 
 def draw(clip: Clip, made: Sequence[Clip], keys: Sequence[int], path: Path) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, notes, say, table
-from poise.cli.options import Flag, Reading, each
+from poise.cli.options import Json, Reading, each
 from poise.errors import PoiseError
 
 #: The keys of a clip in the result, which programs rely on.
@@ -19,42 +17,38 @@ KEYS = (
     *("repairs", "guesses", "in_place"),
 )
 
-
-@dataclass(frozen=True)
-class Options:
-    """Say what motion files hold, and what was guessed: each guess, why, and how to state it instead."""
-
-    clips: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
-    ] = ()
-    """Motion files, or folders of them."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
-
-
 #: What guesses that are numbers are in.
 UNITS = {"unit": " m", "ground": " m", "fps": " frames/s"}
 
 
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Reads every file before the first line is printed."""
-    if not options.clips:
+def run(
+    clips: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
+    ] = (),
+    json: Json = False,
+    reading: OmitArgPrefixes[Reading] = Reading(),
+) -> Answer:
+    """Say what motion files hold, and what was guessed: each guess, why, and how to state it instead.
+
+    Args:
+        clips: motion files, or folders of them.
+    """
+    if not clips:
         raise PoiseError("no clip was given", hint="Write poise info CLIP", code="argument-missing")
-    if any(path.is_dir() for path in options.clips):
-        return each("info", options.clips, None, lambda p, _: run(replace(options, clips=(p,)), argv))
+    if any(path.is_dir() for path in clips):
+        return each("info", clips, None, lambda p, _: run((p,), json, reading))
     from poise.kinematics import find_faults, find_guesses
     from poise.motion.info import describe
 
-    clips = [options.reading.read(path) for path in options.clips]
-    facts, faults = [describe(clip) for clip in clips], [find_faults(clip) for clip in clips]
+    read = [reading.read(path) for path in clips]
+    facts, faults = [describe(clip) for clip in read], [find_faults(clip) for clip in read]
     for fact, fault in zip(facts, faults, strict=True):
         fact["repairs"] = None if fault is None else fault.numbers
         travel = None if fault is None else fault.travel
         fact["in_place"] = None if travel is None else travel.to_dict()
-    for clip, fact in zip(clips, facts, strict=True):
+    for clip, fact in zip(read, facts, strict=True):
         fact["guesses"] = [g.to_dict() for g in find_guesses(clip)]
-    for path, fact, fault in zip(options.clips, facts, faults, strict=True):
+    for path, fact, fault in zip(clips, facts, faults, strict=True):
         table(str(path), ("", ""), _rows(fact), left=2)
         if fact["in_place"]:
             say(f"It {fact['in_place']['said']}; a body is given that travel, see --in-place.")

@@ -8,17 +8,19 @@ becomes a general sentence.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import re
 import shutil
 import textwrap
-from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
-from typing import Any, NoReturn, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass
+from types import ModuleType
+from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
 
-from poise.cli.settings import dotted
+from poise.cli.settings import capital, dotted, texts_of
 from poise.errors import PoiseError, did_you_mean
 
 T = TypeVar("T")
@@ -30,8 +32,11 @@ WIDEST = 100
 _KINDS = {"INT": "a whole number", "FLOAT": "a number"}
 
 
-def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = None) -> T:
-    """The options that `argv` states; default: what is not stated, where that differs from the class's.
+def parse(options: Callable[..., T], argv: Sequence[str], prog: str, default: Any = None) -> T:
+    """What `argv` states of the options of a verb, see `options_of`.
+
+    Args:
+        default: what is not stated, where that differs from the class's.
 
     Raises:
         PoiseError: what tyro refused, in one sentence.
@@ -46,14 +51,33 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
         does = about(options)
         with _told(refuse), _whole_lines(does), contextlib.redirect_stderr(io.StringIO()):
             how: dict[str, Any] = {"prog": prog, "config": _CONFIG, "default": default}
-            made = tyro.cli(options, args=_joined_up(dotted(argv)), description=does, **how)
-        assert made is not None
-        return made
+            if default is None:
+                how.pop("default")
+            return tyro.cli(options, args=_joined_up(dotted(argv)), description=does, **how)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
         what = "the command line was not understood"
         raise PoiseError(what, hint=f"See {prog} --help", code="command-line") from None
+
+
+def options_of(module: ModuleType) -> Callable[..., Any]:
+    """The options of a verb: its class of them, or a function with the arguments of its `run` that
+    returns these by name, with the text on each as its help."""
+    if hasattr(module, "Options"):
+        return module.Options
+    known, hints = inspect.signature(module.run), get_type_hints(module.run, include_extras=True)
+
+    def stated(*values: Any, **named: Any) -> Any:
+        return known.bind(*values, **named).arguments
+
+    typed = [p.replace(annotation=hints[p.name]) for p in known.parameters.values()]
+    texts = texts_of(module.run.__doc__, known.parameters)
+    lines = [f"    {name}: {capital(text)}" for name, text in texts.items()]
+    stated.__doc__ = "\n".join((summary(module.run), "", "Args:", *lines))
+    stated.__annotations__ = hints
+    vars(stated)["__signature__"] = known.replace(parameters=typed)
+    return stated
 
 
 def _joined_up(argv: Sequence[str]) -> list[str]:
@@ -95,11 +119,16 @@ def _whole_lines(kept: str) -> Iterator[None]:
         _strings.remove_single_line_breaks = theirs
 
 
-def about(options: type) -> str:
+def about(options: Callable[..., Any]) -> str:
     """What a verb does, in lines that fit into the window: tyro wraps what it says of options alone."""
     wide = min(shutil.get_terminal_size().columns, WIDEST)
-    lines = joined(options.__doc__ or "").split("\n\n")
+    lines = summary(options).split("\n\n")
     return "\n\n".join(textwrap.fill(line, wide) for line in lines)
+
+
+def summary(options: Callable[..., Any]) -> str:
+    """A docstring without what it says of arguments, each paragraph on a line."""
+    return joined(re.split(r"\n *Args:\n", options.__doc__ or "")[0])
 
 
 def joined(text: str) -> str:
@@ -107,7 +136,7 @@ def joined(text: str) -> str:
     return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n[ \t]*\n", text.strip()))
 
 
-def sentence(event: Any, options: type, prog: str) -> tuple[str, str]:
+def sentence(event: Any, options: Callable[..., Any], prog: str) -> tuple[str, str]:
     """What tyro's event says, in one line, and a hint on the nearest option or the choices."""
     argument = getattr(event, "argument", None)
     name = _name(argument) if argument is not None else ""
@@ -141,7 +170,7 @@ def _name(argument: Any, metavar: bool = False) -> str:
     return f"{flags[0]} {argument.lowered.metavar}" if metavar else flags[-1]
 
 
-def _unknown(tokens: Sequence[str], options: type) -> tuple[str, str]:
+def _unknown(tokens: Sequence[str], options: Callable[..., Any]) -> tuple[str, str]:
     """What is no option, and the option that it is near to."""
     flags = [t.partition("=")[0] for t in tokens if t.startswith("-")]
     if not flags:
@@ -151,10 +180,9 @@ def _unknown(tokens: Sequence[str], options: type) -> tuple[str, str]:
     return f"there is no option {', '.join(flags)}", near.replace("'", "")
 
 
-def _flags(options: type) -> Iterator[str]:
-    for f in fields(options):
-        made = f.default_factory() if callable(f.default_factory) else None
-        if is_dataclass(made):
-            yield from _flags(type(made))
+def _flags(options: Callable[..., Any]) -> Iterator[str]:
+    for name, given in inspect.signature(options).parameters.items():
+        if is_dataclass(given.default):
+            yield from _flags(type(given.default))
         else:
-            yield ("--no-" if f.default is True else "--") + f.name.replace("_", "-")
+            yield ("--no-" if given.default is True else "--") + name.replace("_", "-")

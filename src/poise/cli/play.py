@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from poise.cli.console import Answer
-from poise.cli.options import Flag
+from poise.cli.options import Force, Json, OpenPage
 from poise.cli.training import working
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.keep import may_write
@@ -20,43 +18,38 @@ if TYPE_CHECKING:
     from poise.recipes.imitation import Imitation
 
 
-@dataclass(frozen=True)
-class Options:
-    """Simulate the latest policy of a run from one frame and write a page to watch."""
+def run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None,
+    start: Annotated[int, arg(metavar="FRAME")] = 0,
+    clip: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None,
+    open: OpenPage = False,
+    force: Force = False,
+    json: Json = False,
+) -> Answer:
+    """Simulate the latest policy of a run from one frame and write a page to watch.
 
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a result or of a run."""
-    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
-    """The page to write; by default play.html in the run folder."""
-    start: Annotated[int, arg(metavar="FRAME")] = 0
-    """The frame of the clip to start from."""
-    clip: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """The clip, where the run has several; by default the first one."""
-    open: Flag = False
-    """Open the page in the browser."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-
-
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Simulates one episode to its end and writes its report page."""
-    if options.out is not None:
-        may_write(options.out, options.force)
+    Args:
+        run: the folder of a result or of a run.
+        out: the page to write; by default play.html in the run folder.
+        start: the frame of the clip to start from.
+        clip: the clip, where the run has several; by default the first one.
+    """
+    if out is not None:
+        may_write(out, force)
     from poise.jobs.deliver import make_report
     from poise.jobs.open import open_run
     from poise.score.report import write_report
 
     with working("simulating"):
-        run = open_run(options.run)
-        clip, frame = _place(run.task, options.clip, options.start)
-        page = options.out or run.path / "play.html"
-        write_report(make_report(run.task, run.episode(clip, frame), run.curve), page)
-    if options.open and not webbrowser.open(page.absolute().as_uri()):
+        opened = open_run(run)
+        index, frame = _place(opened.task, clip, start)
+        page = out or opened.path / "play.html"
+        write_report(make_report(opened.task, opened.episode(index, frame), opened.curve), page)
+    if open and not webbrowser.open(page.absolute().as_uri()):
         raise PoiseError("no browser could be opened", page, "Open the page by hand", code="no-browser")
-    clip_name = run.task.library.names[clip]
-    return Answer({"clip": clip_name, "start": options.start}, {"page": page})
+    clip_name = opened.task.library.names[index]
+    return Answer({"clip": clip_name, "start": start}, {"page": page})
 
 
 def _place(imitation: Imitation, name: str | None, start: int) -> tuple[int, int]:

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, say, table
-from poise.cli.options import Flag, Reading, check_range
+from poise.cli.options import (
+    Budget,
+    Force,
+    Json,
+    OpenPage,
+    PolicyFile,
+    Reading,
+    Threads,
+    check_range,
+    lookahead_of,
+)
+from poise.cli.push import direction_of
 from poise.cli.training import working
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.keep import claimed, may_write
@@ -24,139 +34,147 @@ if TYPE_CHECKING:
 RESULTS = ("simulated.bvh", "score.json", "figures.json", "report.html")
 
 
-@dataclass(frozen=True)
-class Options:
+def run(
+    scene: Annotated[Positional[str], arg(metavar="SCENE")],
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")],
+    clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
+    duration: Annotated[float, arg(metavar="SECONDS")] = 8.0,
+    level: Annotated[float | None, arg(metavar="0-1", help_behavior_hint="")] = None,
+    stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None,
+    lag: Annotated[float, arg(metavar="SECONDS")] = 0.5,
+    count: Annotated[int, arg(metavar="N")] = 16,
+    newtons: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None,
+    direction: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None,
+    side: Annotated[Literal["left", "right"] | None, arg(help_behavior_hint="")] = None,
+    lead: Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")] = None,
+    sway: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
+    mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None,
+    other: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None,
+    against: Annotated[Literal["bag", "rival"] | None, arg(help_behavior_hint="")] = None,
+    width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
+    made_for: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
+    height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
+    first: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None,
+    length: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
+    pushes: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None,
+    seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None,
+    policy: PolicyFile = None,
+    learned: Annotated[Path | None, arg(metavar="RUN|none", help_behavior_hint="")] = None,
+    controller: Literal["policy", "lookahead"] = "policy",
+    budget: Budget = None,
+    threads: Threads = 0,
+    open: OpenPage = False,
+    force: Force = False,
+    json: Json = False,
+    reading: OmitArgPrefixes[Reading] = Reading(),
+) -> Answer:
     """Let a trained policy stand, or do a motion, in a scene in which something pushes it: a ball that
     is thrown, a sustained pull, a partner hand in hand, a door, a trampoline, a ball on a rod on its
     head, or an opponent that hops on one leg as it does. It gives way; the same is simulated without
-    compliance, and a table compares both. Writes the motion, figures.json, score.json, report.html."""
+    compliance, and a table compares both. Writes the motion, figures.json, score.json, report.html.
 
-    scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """throws, pull, hands, door, trampoline, ball or chicken."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
-    """The folder of the results."""
-    clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """What the character does; by default it stands."""
-    duration: Annotated[float, arg(metavar="SECONDS")] = 8.0
-    """How long it stands."""
-    level: Annotated[float | None, arg(metavar="0-1", help_behavior_hint="")] = None
-    """Level of compliance; by default 0.16, or for the ball a stiffness."""
-    stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None
-    """Give way as a spring of so many newtons per metre in place of --level."""
-    lag: Annotated[float, arg(metavar="SECONDS")] = 0.5
-    """How fast it gives way with --stiffness: the time constant. Held hands need a slow one."""
-    count: Annotated[int, arg(metavar="N")] = 16
-    """Episodes, side by side, that begin a hair apart; the report shows the first."""
-    newtons: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
-    """pull: how hard (20)."""
-    direction: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
-    """pull: where to, Z up (0,1,0)."""
-    side: Annotated[Literal["left", "right"] | None, arg(help_behavior_hint="")] = None
-    """pull, hands: which hand (left)."""
-    lead: Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")] = None
-    """hands: how much faster than the motion the partner goes (0)."""
-    sway: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """hands: how far the partner's hand swings (0.1)."""
-    mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
-    """throws: of the ball (1). chicken: of the player (85)."""
-    other: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
-    """chicken: of the opponent (36)."""
-    against: Annotated[Literal["bag", "rival"] | None, arg(help_behavior_hint="")] = None
-    """chicken: a punching bag as heavy as the opponent (default), or the opponent itself."""
-    width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """door: how wide (1)."""
-    made_for: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """door: how wide the door is for which the motion is made; by default the door's own width."""
-    height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """trampoline: how far its actuators rise for a bounce (0.15)."""
-    first: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
-    """trampoline: when the first bounce begins (1)."""
-    length: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """ball: of the rod (1)."""
-    pushes: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
-    """ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0)."""
-    seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None
-    """throws, ball, chicken: of the draws (0)."""
-    policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
-    along and is told places alone; by default the one for rotations that comes with Poise."""
-    learned: Annotated[Path | None, arg(metavar="RUN|none", help_behavior_hint="")] = None
-    """What was learned on top of the policy: the folder of poise train compliant SCENE. For the ball
-    something comes along; none goes without."""
-    controller: Literal["policy", "lookahead"] = "policy"
-    """The policy alone, or with lookahead, which tries what it may do in copies of the scene."""
-    budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
-    """Lookahead: control steps simulated for each that is made (192)."""
-    threads: Annotated[int, arg(metavar="N")] = 0
-    """Cores; 0 is all."""
-    open: Flag = False
-    """Open the page in the browser."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
-
-
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Plays the scene with and without compliance, and writes what came of it."""
-    o = options
-    check_range("count", o.count, 1, 1024)
-    check_range("duration", o.duration, 0.5, 3600)
-    check_range("threads", o.threads, 0)
-    check_range("budget", o.budget, 1, 1_000_000)
-    if o.budget is not None and o.controller != "lookahead":
+    Args:
+        scene: throws, pull, hands, door, trampoline, ball or chicken.
+        out: the folder of the results.
+        clip: what the character does; by default it stands.
+        duration: how long it stands.
+        level: level of compliance; by default 0.16, or for the ball a stiffness.
+        stiffness: give way as a spring of so many newtons per metre in place of --level.
+        lag: how fast it gives way with --stiffness: the time constant. Held hands need a slow one.
+        count: episodes, side by side, that begin a hair apart; the report shows the first.
+        newtons: pull: how hard (20).
+        direction: pull: where to, Z up (0,1,0).
+        side: pull, hands: which hand (left).
+        lead: hands: how much faster than the motion the partner goes (0).
+        sway: hands: how far the partner's hand swings (0.1).
+        mass: throws: of the ball (1). chicken: of the player (85).
+        other: chicken: of the opponent (36).
+        against: chicken: a punching bag as heavy as the opponent (default), or the opponent itself.
+        width: door: how wide (1).
+        made_for: door: how wide the door is for which the motion is made; by default the door's own
+            width.
+        height: trampoline: how far its actuators rise for a bounce (0.15).
+        first: trampoline: when the first bounce begins (1).
+        length: ball: of the rod (1).
+        pushes: ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0).
+        seed: throws, ball, chicken: of the draws (0).
+        learned: what was learned on top of the policy: the folder of poise train compliant SCENE. For
+            the ball something comes along; none goes without.
+        controller: the policy alone, or with lookahead, which tries what it may do in copies of the
+            scene.
+        budget: simulated control steps of lookahead for each that is made, by default 192.
+    """
+    check_range("count", count, 1, 1024)
+    check_range("duration", duration, 0.5, 3600)
+    check_range("threads", threads, 0)
+    if budget is not None and controller != "lookahead":
         what = "--budget is for --controller lookahead"
         raise PoiseError(
             what, hint="Add --controller lookahead, or leave --budget out", code="option-needs-option"
         )
     for name in RESULTS:
-        may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
+        may_write(out / name, force, *([clip] if clip else []))
     from poise.jobs.open import open_run
-    from poise.papers.compliant.play import play
-    from poise.papers.compliant.training import open_learned, shipped
-    from poise.plan import LookaheadConfig
+    from poise.papers.compliant.scene_play import play
+    from poise.papers.compliant.scene_training import open_learned, shipped
 
-    how = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
-    scene, given = scene_of(o), given_of(o)
-    clip = None if o.clip is None else o.reading.read(o.clip)
+    how = lookahead_of(budget)
+    stated: dict[str, Any] = {
+        "newtons": newtons,
+        "direction": direction_of(direction),
+        "side": side,
+        "lead": lead,
+        "sway": sway,
+        "mass": mass,
+        "width": width,
+        "made_for": made_for,
+        "height": height,
+        "first": first,
+        "length": length,
+        "pushes": pushes,
+        "other": other,
+        "against": against,
+        "seed": seed,
+    }
+    place, given = scene_of(scene, stated), given_of(level, stiffness, lag)
+    motion = None if clip is None else reading.read(clip)
     with working("opening the policy"):
-        tracker = open_run(o.policy).tracker
-        stated = o.level is not None or o.stiffness is not None
-        if o.learned is None:
-            alone = stated or o.controller == "lookahead"
-            learned = None if alone else shipped(o.scene, tracker)
+        tracker = open_run(policy).tracker
+        chosen = level is not None or stiffness is not None
+        if learned is None:
+            alone = chosen or controller == "lookahead"
+            knows = None if alone else shipped(scene, tracker)
         else:
-            learned = None if str(o.learned) == "none" else open_learned(o.learned, tracker)
-    if learned is not None and learned.config.scene != o.scene:
-        what = f"the run learned the scene '{learned.config.scene}', not '{o.scene}'"
+            knows = None if str(learned) == "none" else open_learned(learned, tracker)
+    if knows is not None and knows.config.scene != scene:
+        what = f"the run learned the scene '{knows.config.scene}', not '{scene}'"
         raise PoiseError(
-            what, o.learned, f"Write poise play compliant {learned.config.scene}", code="scene-differs"
+            what, learned, f"Write poise play compliant {knows.config.scene}", code="scene-differs"
         )
-    if learned is not None and stated:
+    if knows is not None and chosen:
         raise PoiseError(
             "a run gives way as it has learned to",
             hint="Leave --level, --stiffness out",
             code="option-not-applicable",
         )
-    with claimed(o.out):
+    with claimed(out):
         with working("simulating"):
-            more = (o.count, o.duration, o.threads, o.scene, learned, o.controller, how)
-            played = play(scene, tracker, clip, given, *more)
+            more = (count, duration, threads, scene, knows, controller, how)
+            played = play(place, tracker, motion, given, *more)
         with working("writing"):
-            paths = played.write(o.out)
+            paths = played.write(out)
     rows = [(played.words[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
-    table(f"{o.scene}, {o.count} episodes", ("", "compliant", "without"), rows, left=1)
+    table(f"{scene}, {count} episodes", ("", "compliant", "without"), rows, left=1)
     say(played.sentence())
-    if o.open and not webbrowser.open(paths["report"].absolute().as_uri()):
+    if open and not webbrowser.open(paths["report"].absolute().as_uri()):
         raise PoiseError(
             "no browser could be opened", paths["report"], "Open the page by hand", code="no-browser"
         )
-    result = {"scene": o.scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
+    result = {"scene": scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
     return Answer(result, paths, () if given is None else given.notes)
 
 
-def given_of(options: Options) -> Compliance | Stiffness | None:
+def given_of(level: float | None, stiffness: float | None, lag: float) -> Compliance | Stiffness | None:
     """How the character gives way; None leaves it to the scene.
 
     Raises:
@@ -164,38 +182,30 @@ def given_of(options: Options) -> Compliance | Stiffness | None:
     """
     from poise.control import Compliance, Stiffness
 
-    if options.stiffness is not None:
-        return Stiffness(options.stiffness, options.lag)
-    return None if options.level is None else Compliance(options.level)
+    if stiffness is not None:
+        return Stiffness(stiffness, lag)
+    return None if level is None else Compliance(level)
 
 
-def scene_of(options: Options) -> PlayScene:
-    """The scene with what is stated of it.
+def scene_of(scene: str, stated: dict[str, Any]) -> PlayScene:
+    """The scene with what is stated of it; None is not.
 
     Raises:
         PoiseError: no such scene, or an option of another one.
     """
-    from poise.cli.push import direction_of
     from poise.papers.compliant.scenes import SCENES
 
-    o = options
-    if o.scene not in SCENES:
-        known = f"{did_you_mean(o.scene, list(SCENES))}"
-        raise PoiseError(f"there is no scene '{o.scene}'", hint=known, code="unknown-scene")
-    kind: Any = SCENES[o.scene]
-    stated: dict[str, Any] = {
-        "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
-        "sway": o.sway, "mass": o.mass, "width": o.width, "made_for": o.made_for, "height": o.height,
-        "first": o.first, "length": o.length, "pushes": o.pushes, "other": o.other,
-        "against": o.against, "seed": o.seed,
-    }  # fmt: skip
+    if scene not in SCENES:
+        known = f"{did_you_mean(scene, list(SCENES))}"
+        raise PoiseError(f"there is no scene '{scene}'", hint=known, code="unknown-scene")
+    kind: Any = SCENES[scene]
     stated = {k: v for k, v in stated.items() if v is not None}
     own = {f.name for f in fields(kind)}
     for name in stated:
         if name not in own:
             option = "--" + name.replace("_", "-")
             raise PoiseError(
-                f"{option} says nothing of the scene '{o.scene}'",
+                f"{option} says nothing of the scene '{scene}'",
                 hint="Leave it out",
                 code="option-not-applicable",
             )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.console import Answer, say, table
-from poise.cli.options import Flag, Reading
+from poise.cli.options import Flag, Force, Json, Reading
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 
@@ -18,50 +17,44 @@ if TYPE_CHECKING:
     from poise.kinematics import RetargetReport
 
 
-@dataclass(frozen=True)
-class Options:
+def run(
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")],
+    onto: Annotated[Path, arg(metavar="FILE")],
+    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")],
+    map: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="JOINT=JOINT")] = (),
+    onto_skeleton: Annotated[Path | None, arg(metavar="ASF", help_behavior_hint="")] = None,
+    contacts: Flag = True,
+    force: Force = False,
+    json: Json = False,
+    reading: OmitArgPrefixes[Reading] = Reading(),
+) -> Answer:
     """Move a clip onto another human skeleton: joints are matched by their names, steps scaled by the
-    legs, standing feet kept standing. A tremble is taken off first, unless --raw says to keep it."""
+    legs, standing feet kept standing. A tremble is taken off first, unless --raw says to keep it.
 
-    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
-    """The motion file."""
-    onto: Annotated[Path, arg(metavar="FILE")]
-    """Any motion file with the skeleton that shall move, or an ASF skeleton alone."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
-    """The motion file to write; its suffix names the format (.bvh)."""
-    map: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="JOINT=JOINT")] = ()
-    """A joint of CLIP and the joint that it moves, such as LeftArm=upperarm_l; or a joint and its part,
-    such as left_upper_arm=upperarm_l."""
-    onto_skeleton: Annotated[Path | None, arg(metavar="ASF", help_behavior_hint="")] = None
-    """The ASF skeleton where FILE is an AMC."""
-    contacts: Flag = True
-    """Do not hold standing feet and hands where the clip has them."""
-    force: Flag = False
-    """Write over files that are there."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
-
-
-def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Reads both files, moves the motion over, writes, says what was matched and measured."""
+    Args:
+        clip: the motion file.
+        onto: any motion file with the skeleton that shall move, or an ASF skeleton alone.
+        out: the motion file to write; its suffix names the format (.bvh).
+        map: a joint of CLIP and the joint that it moves, such as LeftArm=upperarm_l; or a joint and its
+            part, such as left_upper_arm=upperarm_l.
+        onto_skeleton: the ASF skeleton where FILE is an AMC.
+        contacts: do not hold standing feet and hands where the clip has them.
+    """
     from poise.formats import read_skeleton, write_clip
     from poise.kinematics import RetargetConfig, retarget, without_noise
 
-    out = options.out
-    may_write(out, options.force, options.clip, options.onto)
-    mapping = pairs(options.map)
-    clip = options.reading.read(options.clip)
-    onto = read_skeleton(options.onto, options.onto_skeleton)
-    config = RetargetConfig(contacts=options.contacts, clear=options.contacts)
-    calm, cleaned = without_noise(clip)
-    made, report = retarget(calm, onto, mapping, config)
+    may_write(out, force, clip, onto)
+    mapping = pairs(map)
+    source, target = reading.read(clip), read_skeleton(onto, onto_skeleton)
+    config = RetargetConfig(contacts=contacts, clear=contacts)
+    calm, cleaned = without_noise(source)
+    made, report = retarget(calm, target, mapping, config)
     write_clip(made, out)
     show(report)
     say(f"{made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
     # Both files' guesses (unit, vertical, ...) decide what is written.
-    guessed = [*clip.skeleton.source.notes]
-    guessed += [f"{options.onto.name}: {n}" for n in onto.skeleton.source.notes]
+    guessed = [*source.skeleton.source.notes]
+    guessed += [f"{target.name}: {n}" for n in target.skeleton.source.notes]
     said = [*guessed, *cleaned.noise_sentences(), *report.sentences()]
     return Answer(report.to_dict(), {"clip": out}, said)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
 from pathlib import Path
 from types import NoneType, SimpleNamespace
@@ -26,16 +26,18 @@ T = TypeVar("T")
 #: The dataclass of each recipe's settings.
 SOURCES = {
     "residual-force": "poise.recipes.residual_force_settings:ResidualForce",
-    "inbetween": "poise.jobs.inbetween.settings:Inbetween",
-    "perpetual": "poise.recipes.perpetual_settings:Perpetual",
-    "endless": "poise.jobs.endless.training:Endless",
-    "compliant": "poise.papers.compliant.training:Compliant",
+    "inbetween": "poise.jobs.inbetween.inbetween_settings:Inbetween",
+    "perpetual": "poise.papers.perpetual.ablations:StagedPerpetual",
+    "endless": "poise.jobs.endless.endless_training:Endless",
+    "compliant": "poise.papers.compliant.scene_training:Compliant",
 }
+#: The dataclass of how a motion is tracked.
+TRACK = "poise.jobs.track_settings:TrackConfig"
 _METAVARS = {float: "X", int: "N", str: "TEXT"}
 
 
 def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
-    """A frozen dataclass of options for the fields `names` of a recipe's settings.
+    """A frozen dataclass of options for the fields `names` of settings: of a recipe, or at a place.
 
     A field that the command line does not state is None, or for a switch its default, so that
     `given` knows what was stated.
@@ -46,7 +48,7 @@ def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
     """
     from tyro.conf import arg
 
-    kind = imported(SOURCES[recipe])
+    kind = imported(SOURCES.get(recipe, recipe))
     texts, made = _texts(kind), []
     for name in (*names, *flags):
         type_, default, text = _plain_type(kind, name), getattr(kind, name), texts[name]
@@ -54,35 +56,44 @@ def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
         how: dict[str, Any] = {"name": flags.get(name), "help_behavior_hint": hint}
         if type_ is bool:
             off = "" if not default or text.startswith("off,") else "switch off: "
-            how |= {"help": _upper(prefix + off + text), "help_behavior_hint": ""}
+            how |= {"help": capital(prefix + off + text), "help_behavior_hint": ""}
             made.append((name, Annotated[bool, arg(**how)], field(default=default)))
             continue
         values = [str(v) for v in get_args(type_)]
-        how |= {"help": _upper(prefix + text), "metavar": "|".join(values) or _METAVARS[type_]}
+        how |= {"help": capital(prefix + text), "metavar": "|".join(values) or _METAVARS[type_]}
         made.append((name, Annotated[type_ | None, arg(**how)], field(default=None)))
     return make_dataclass(f"Settings{kind.__name__}", made, frozen=True)
 
 
-def _upper(text: str) -> str:
+def capital(text: str) -> str:
+    """A text that begins with a capital, but for a name before a colon ("perpetual: ...")."""
     return text if re.match(r"\w+: ", text) else text[:1].upper() + text[1:]
 
 
 def _plain_type(kind: type, name: str) -> Any:
     """The type of a setting without its None; those of other settings may need torch."""
+    kind = next(k for k in kind.__mro__ if name in vars(k).get("__annotations__", {}))
     one = SimpleNamespace(__annotations__={name: kind.__annotations__[name]})
     found = get_type_hints(one, vars(sys.modules[kind.__module__]))[name]
     others = [a for a in get_args(found) if a is not NoneType]
     return found if get_origin(found) is Literal or not others else others[0]
 
 
-def _texts(kind: type) -> dict[str, str]:
-    """Each entry `name: text` of a docstring, on one line or of several."""
-    names = "|".join(f.name for f in fields(kind))
-    flat = " ".join((kind.__doc__ or "").split())
+def texts_of(doc: str | None, known: Iterable[str]) -> dict[str, str]:
+    """Each entry `name: text` of a docstring for the names that are known, on one line or of several."""
+    names, flat = "|".join(known), " ".join((doc or "").split())
     parts = re.split(rf"(?:(?<=[.:] )|^)((?:{names})(?:, (?:{names}))*): ", flat)
     out: dict[str, str] = {}
     for listed, text in zip(parts[1::2], parts[2::2], strict=True):
         out |= dict.fromkeys(listed.split(", "), text.replace("`", "").strip())
+    return out
+
+
+def _texts(kind: type) -> dict[str, str]:
+    """What the docstrings of a dataclass and of those that it extends say of its fields."""
+    names, out = [f.name for f in fields(kind)], dict[str, str]()
+    for owner in kind.__mro__[-2::-1]:
+        out |= texts_of(owner.__doc__, names)
     return out
 
 
@@ -147,9 +158,7 @@ def base_of(
         return from_toml(type(default), config, verb)
     if preset is None:
         return default
-    from poise.jobs.presets import preset_of
-
-    return preset_of(recipe, preset, clip)
+    return imported("poise.jobs.presets:preset_of")(recipe, preset, clip)
 
 
 def dotted(argv: Sequence[str]) -> list[str]:

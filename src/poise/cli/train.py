@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, say
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
+from poise.cli.options import Body, Chosen, Json, Reading, Training, printed
 from poise.cli.settings import SOURCES, given
 from poise.cli.train_inbetween import Network
 from poise.cli.train_perpetual import BY_HAND, Primitives, goes_on, settings
@@ -45,15 +45,14 @@ class Options:
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
     """Motion files. compliant: the scene, ball or door."""
-    json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
-    training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    json: Json = False
+    training: OmitArgPrefixes[Training] = Training()
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
-    library: OmitArgPrefixes[Library] = field(default_factory=Library)
-    network: OmitArgPrefixes[Network] = field(default_factory=Network)
-    primitives: OmitArgPrefixes[Primitives] = field(default_factory=Primitives)
-    body: OmitArgPrefixes[Body] = field(default_factory=Body)
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+    library: OmitArgPrefixes[Library] = Library()
+    network: OmitArgPrefixes[Network] = Network()
+    primitives: OmitArgPrefixes[Primitives] = Primitives()
+    body: OmitArgPrefixes[Body] = Body()
+    reading: OmitArgPrefixes[Reading] = Reading()
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
@@ -92,10 +91,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             code="argument-missing",
         )
     from poise.jobs.imitate import Job
+    from poise.jobs.practice import Watching
 
     t = o.training
     with Shown(o.clips, o.reading, t, o.out, o.out) as shown:
-        how = (t.threads, t.device, "auto", shown.watching(), True)
+        how = (t.threads, t.device, "auto", Watching(**shown.callbacks), True)
         result = Job(shown.read, o.out, config, t.until(), *how).learned()[1]
     if result.interrupted:
         return stopped(o.out, again)

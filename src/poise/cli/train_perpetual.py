@@ -22,8 +22,8 @@ from poise.jobs.keep import claimed
 from poise.settings import imported
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.run import PerpetualResult
-    from poise.jobs.perpetual.stage_order import Progress
+    from poise.jobs.perpetual.perpetual_run import PerpetualResult
+    from poise.jobs.perpetual.stages import Progress
     from poise.recipes.imitation import Imitation
     from poise.score import RecoveryCard
 
@@ -118,8 +118,8 @@ def shown() -> Iterator[Callable[[Progress], None]]:
 
 if TYPE_CHECKING:
     from poise.jobs.tracker import Tracker
+    from poise.papers.perpetual.ablations import StagedPerpetual
     from poise.recipes.imitation import Imitation
-    from poise.recipes.perpetual_settings import Perpetual
 
     _Derived: TypeAlias = Any
 else:
@@ -163,11 +163,18 @@ class Primitives(_Derived):
 BY_HAND = ("recovery_clips", "going_on", "paths", "style", "teacher")
 
 
+def recipe(additive: bool) -> StagedPerpetual:
+    """The settings before anything is stated but the kind of actions."""
+    from poise.papers.perpetual.ablations import StagedPerpetual
+
+    return StagedPerpetual.additive() if additive else StagedPerpetual()
+
+
 def settings(
     primitives: Primitives, training: Training, body: Body, options: Mapping[str, Any]
-) -> Perpetual:
+) -> StagedPerpetual:
     """The recipe's settings. options: by name, what the options state."""
-    from poise.recipes import perpetual
+    from poise.papers.perpetual.ablations import ONE_NETWORK, StagedPerpetual
 
     values = {name: value for name, value in options.items() if name not in BY_HAND}
     if not 1 <= values.get("max_primitives", 1) <= 64:
@@ -188,12 +195,12 @@ def settings(
     if not primitives.style:
         values["style"] = None
     additive = values.get("action") == "additive"
-    default = perpetual.Perpetual.additive() if additive else perpetual.Perpetual()
+    default = recipe(additive)
     if primitives.teacher == LOOKAHEAD:
         default = default.taught()
     elif primitives.teacher:
         from poise.jobs.open import open_run
-        from poise.jobs.perpetual.stage_start import taught_by
+        from poise.jobs.perpetual.distillation import taught_by
 
         if primitives.going_on is not None:
             what = "--teacher POLICY is imitated by a new network, and --from goes on with one"
@@ -202,6 +209,7 @@ def settings(
             )
         goal = {"goal": values["goal"]} if "goal" in values else {}
         default = taught_by(open_run(Path(primitives.teacher)).tracker.config, **goal)
+        default = StagedPerpetual.of(default, **ONE_NETWORK)
     return training.settings("perpetual", default, body, values)
 
 
@@ -228,7 +236,8 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
 
     returns: the policy tracks recovery motions already, so that primitives may learn what it fails.
     """
-    from poise.jobs.perpetual.run import KEPT
+    from poise.jobs.perpetual import perpetual_run
+    from poise.papers.perpetual import ablations
 
     library, primitives, body = o.library, o.primitives, o.body
     if library.onto is not None:
@@ -243,7 +252,7 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     more, of_the_body = stated(body.set, imported(SOURCES["perpetual"]))
     names += [text.partition("=")[0] for text in of_the_body]
     # A part that is kept, one of its settings, or a part with a setting that is kept.
-    kept = [f"{name}." for name in KEPT]
+    kept = [f"{name}." for name in perpetual_run.KEPT | ablations.KEPT]
     names += [n for n in more if any(f"{n}.".startswith(k) or k.startswith(f"{n}.") for k in kept)]
     if names:
         what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
@@ -251,13 +260,13 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     return more
 
 
-def goes_on(o: TrainOptions, config: Perpetual) -> tuple[Tracker, Perpetual]:
+def goes_on(o: TrainOptions, config: StagedPerpetual) -> tuple[Tracker, StagedPerpetual]:
     """The policy of --from, and the settings of a run that goes on from it.
 
     config: what the command line states without it.
     """
     from poise.jobs.open import open_run
-    from poise.jobs.perpetual.run import going_on
+    from poise.papers.perpetual.ablations import going_on
 
     primitives, asked = o.primitives, o.recipe_settings.num_envs
     assert primitives.going_on is not None
@@ -274,7 +283,7 @@ def goes_on(o: TrainOptions, config: Perpetual) -> tuple[Tracker, Perpetual]:
     return tracker, configured(config, more)
 
 
-def run(o: TrainOptions, config: Perpetual, again: str) -> Answer:
+def run(o: TrainOptions, config: StagedPerpetual, again: str) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
     library, primitives, out, training = o.library, o.primitives, o.out, o.training
     library.folder("perpetual")
@@ -283,7 +292,7 @@ def run(o: TrainOptions, config: Perpetual, again: str) -> Answer:
         raise PoiseError(
             "the recipe perpetual trains in one process", hint=hint, code="option-not-applicable"
         )
-    from poise.jobs.perpetual.run import train
+    from poise.jobs.perpetual.perpetual_run import train
     from poise.jobs.run_file import RUN_FILE
     from poise.learn import LATEST, Until
 
@@ -300,7 +309,7 @@ def run(o: TrainOptions, config: Perpetual, again: str) -> Answer:
     t, result, trained = training, None, None
     # A run that was killed before its first checkpoint begins as if it had not been begun.
     if tracker is not None and not (out / LATEST).exists():
-        from poise.jobs.perpetual.stage_start import distilled
+        from poise.jobs.perpetual.distillation import distilled
         from poise.jobs.warm_start import widened
 
         if primitives.going_on is None:
@@ -333,7 +342,7 @@ def _teacher(primitives: Primitives, library: Library) -> Tracker:
 def begin(
     library: Library,
     out: Path,
-    config: Perpetual,
+    config: StagedPerpetual,
     training: Training,
     held: bool,
     tracker: Tracker | None,
@@ -343,7 +352,7 @@ def begin(
     held: the run folder holds a run already, which then is all that is read. tracker: the policy that it
     goes on from or is taught by.
     """
-    from poise.jobs.perpetual import run as perpetual_run
+    from poise.jobs.perpetual import perpetual_run
 
     folder = library.folder("perpetual")
     hold_out, never = ((p,) if p else () for p in (library.hold_out, library.never))

@@ -12,7 +12,7 @@ from poise.formats.text import MAX_JOINTS, MAX_VALUE, check_file
 from poise.formats.usd import raw_of_matrices
 from poise.motion.clip import MAX_POSES, Clip
 
-_SCRIPT = Path(__file__).with_name("scene.py")
+_SCRIPT = Path(__file__).with_name("fbx_scene.py")
 _MISSING = "Install it with: pip install ufbx; or export BVH, glTF or USD"
 
 

@@ -20,7 +20,7 @@ from poise.formats.point_noise import (
 )
 from poise.formats.text import listed
 from poise.motion.keypoints import Keypoints
-from poise.motion.smoothing import filled
+from poise.motion.smoothing import NOTHING_MM, filled, only_noise
 
 # What a place is filled relative to, so that a hidden wrist travels with its elbow.
 _CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
@@ -149,6 +149,10 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
     if smooth_hz is None and not points.source.raw:
         tracks, found = still(tracks, points.fps)
     if found is not None:
+        if found.size_mm > NOTHING_MM:
+            frames = slice(start, start + len(tracks[NEEDED[0]]))
+            size = f"{found.size_mm / 1e3:.2g} m"
+            raise only_noise(points.source.path or points.name, frames, size)
         notes.append(
             f"The keypoints tremble by {found.size_mm:.0f} mm {found.how}: the tremble is taken off "
             "(--raw keeps it)"

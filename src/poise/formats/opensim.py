@@ -16,7 +16,7 @@ import torch
 from poise.errors import PoiseError
 from poise.formats.arrays import numeric, refuse_bad, require
 from poise.formats.guess import check_radians, few_degrees
-from poise.formats.raw import RawMotion, ReadOptions, assemble
+from poise.formats.raw import RawMotion, ReadOptions, assemble, sided, tree_of
 from poise.formats.text import CUT_OFF, MAX_VALUE, decode, listed, number_table, read_bytes, shown
 from poise.motion.clip import Clip, check_frames
 from poise.motion.rotations import axis_angle_to_quat, quat_mul
@@ -28,7 +28,8 @@ _PELVIS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis
 _STANDING_M = 0.94
 _SPINE = ("L5_S1", "L4_L5", "L3_L4", "L2_L3", "L1_L2", "L1_T12")
 
-# Joint, parent, offset (m). "*" stands for a side, r or l; Z is mirrored on the left.
+_SIDES = (("r", 1.0), ("l", -1.0))
+# Joint, parent, offset (m). "*" stands for a side; Z is mirrored on the left.
 _BONES = (
     ("pelvis", None, (0.0, 0.0, 0.0)),
     ("hip_*", "pelvis", (-0.06, -0.07, 0.08)),
@@ -208,21 +209,16 @@ def _clip(
         )
     for name, values in turns.items():
         refuse_bad(values, f"coordinate {shown(name)}", path)
-    rows = [
-        (_side(name, side), _side(parent, side) if parent else None, _mirrored(offset, side))
-        for name, parent, offset in _BONES
-        for side in ("rl" if "*" in name else "r")
-    ]
-    names = tuple(r[0] for r in rows)
-    tips = [(_side(n, s), _mirrored(v, s)) for n, v in _TIPS for s in ("rl" if "*" in n else "r")]
+    names, parents, offsets = tree_of(sided(_BONES, _SIDES, 2))
+    tips = sided(((n, None, v) for n, v in _TIPS), _SIDES, 2)
     notes.append("The file holds no bones: those of Poise's default body of 1.70 m were taken")
     raw = RawMotion(
         format="opensim",
         path=path,
         names=names,
-        parents=tuple(-1 if p is None else names.index(p) for _, p, _ in rows),
-        offsets=np.array([r[2] for r in rows]),
-        ends=tuple((names.index(n), tip) for n, tip in tips),
+        parents=parents,
+        offsets=offsets,
+        ends=tuple((names.index(n), tip) for n, _, tip in tips),
         root_pos=np.stack([turns[f"pelvis_t{c}"] for c in "xyz"], -1),
         rot=np.stack([_turned(n, turns) for n in names], 1),
         fps=fps,
@@ -236,10 +232,6 @@ def _clip(
 
 def _side(name: str, side: str) -> str:
     return name.replace("*", side)
-
-
-def _mirrored(v: tuple[float, float, float], side: str) -> tuple[float, float, float]:
-    return (v[0], v[1], v[2] if side == "r" else -v[2])
 
 
 def _turned(joint: str, turns: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,26 @@ class ReadOptions:
 
 
 UNSTATED = ReadOptions()
+
+#: A joint of a layout: its name, its parent and its offset, m; "*" in names stands for a side.
+Row = tuple[str, str | None, tuple[float, float, float]]
+
+
+def sided(rows: Iterable[Row], sides: Sequence[tuple[str, float]], axis: int = 0) -> list[Row]:
+    """The rows, those of a side once for each of `sides`: its name, and the sign of its `axis`."""
+    out: list[Row] = []
+    for name, parent, offset in rows:
+        for side, sign in sides if "*" in name else (("", 1.0),):
+            x, y, z = (sign * v if k == axis else v for k, v in enumerate(offset))
+            out.append((name.replace("*", side), parent and parent.replace("*", side), (x, y, z)))
+    return out
+
+
+def tree_of(rows: Sequence[Row]) -> tuple[tuple[str, ...], tuple[int, ...], np.ndarray]:
+    """Names, parents and offsets `(J, 3)` of joints."""
+    names = tuple(name for name, *_ in rows)
+    parents = tuple(-1 if parent is None else names.index(parent) for _, parent, _ in rows)
+    return names, parents, np.array([offset for *_, offset in rows])
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,12 @@ from poise.formats.people import MOST_PEOPLE, one_person
 from poise.formats.raw import (
     RawMotion,
     ReadOptions,
+    Row,
     assemble,
     evidence,
     quats_from_z_up,
+    sided,
+    tree_of,
     vectors_from_z_up,
     vectors_to_z_up,
 )
@@ -112,59 +115,33 @@ class SmplLayout:
         return 3 * len(self.names)
 
 
-_Row = tuple[str, str | None, tuple[float, float, float]]
+def _hand() -> list[Row]:
+    """The fingers of a side."""
+    return [
+        (f"*_{finger}{i + 1}", f"*_{finger}{i}" if i else "*_wrist", step)
+        for finger in _FINGERS
+        for i, step in enumerate(_FINGER_BONES[finger])
+    ]
 
 
-def _sided(name: str, side: str) -> str:
-    return name.replace("*", side)
-
-
-def _mirrored(v: tuple[float, float, float], sign: float) -> tuple[float, float, float]:
-    return (v[0] * sign, v[1], v[2])
-
-
-def _expand(rows: tuple[_Row, ...]) -> list[_Row]:
-    """The rows with each sided one replaced by its left and its right one."""
-    out: list[_Row] = []
-    for name, parent, offset in rows:
-        for side, sign in _SIDES if "*" in name else ((None, 1.0),):
-            if side is None:
-                out.append((name, parent, offset))
-            else:
-                out.append((_sided(name, side), _sided(parent or "", side), _mirrored(offset, sign)))
-    return out
-
-
-def _hand(side: str, sign: float) -> list[_Row]:
-    out: list[_Row] = []
-    for finger in _FINGERS:
-        for i, step in enumerate(_FINGER_BONES[finger]):
-            parent = f"{side}_{finger}{i}" if i else f"{side}_wrist"
-            out.append((f"{side}_{finger}{i + 1}", parent, _mirrored(step, sign)))
-    return out
-
-
-def _layout(name: str, rows: list[_Row]) -> SmplLayout:
-    names = tuple(r[0] for r in rows)
-    parents = tuple(-1 if r[1] is None else names.index(r[1]) for r in rows)
-    tips = []
-    for key, tip in _TIPS.items():
-        for side, sign in _SIDES if "*" in key else (("", 1.0),):
-            joint = _sided(key, side)
-            # The head ends in its tip even where a jaw and eyes follow it.
-            if joint in names and (names.index(joint) not in parents or key == "head"):
-                tips.append((names.index(joint), _mirrored(tip, sign)))
-    offsets = np.array([r[2] for r in rows])
+def _layout(name: str, rows: list[Row]) -> SmplLayout:
+    names, parents, offsets = tree_of(rows)
     offsets.flags.writeable = False
-    return SmplLayout(name, names, parents, offsets, tuple(sorted(tips)))
+    tips = sorted(
+        (names.index(joint), tip)
+        for joint, _, tip in sided(((key, None, tip) for key, tip in _TIPS.items()), _SIDES)
+        # The head ends in its tip even where a jaw and eyes follow it.
+        if joint in names and (names.index(joint) not in parents or joint == "head")
+    )
+    return SmplLayout(name, names, parents, offsets, tuple(tips))
 
 
 def _layouts() -> tuple[SmplLayout, ...]:
-    body = _expand(_BODY)
-    hands = [row for side, sign in _SIDES for row in _hand(side, sign)]
+    body, palms = sided(_BODY, _SIDES), sided(_HANDS, _SIDES)
+    hands = [row for side in _SIDES for row in sided(_hand(), (side,))]
     return (
         _layout("SMPL body", body),
-        _layout("SMPL", body + _expand(_HANDS)),
+        _layout("SMPL", body + palms),
         _layout("SMPL-H", body + hands),
         _layout("SMPL-X", body + list(_FACE) + hands),
     )

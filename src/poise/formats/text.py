@@ -7,7 +7,8 @@ import os
 import secrets
 import stat
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -79,16 +80,22 @@ def check_file(path: Path, limit: int = MAX_FILE_BYTES) -> int:
     return info.st_size
 
 
-def read_head(path: Path) -> bytes:
-    """The first bytes of a file, after `check_file`."""
-    check_file(path)
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Says in one sentence that a file cannot be read."""
     try:
-        with path.open("rb") as file:
-            return file.read(4096)
+        yield
     except OSError as error:
         raise PoiseError(
             f"the file cannot be read ({error.strerror})", path, code="file-unreadable"
         ) from None
+
+
+def read_head(path: Path) -> bytes:
+    """The first bytes of a file, after `check_file`."""
+    check_file(path)
+    with _reading(path), path.open("rb") as file:
+        return file.read(4096)
 
 
 def below_comments(path: Path, most: int = 4 << 20) -> bytes:
@@ -103,12 +110,8 @@ def below_comments(path: Path, most: int = 4 << 20) -> bytes:
 def read_binary(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """All bytes of a file of any kind, after `check_file`."""
     check_file(path, limit)
-    try:
+    with _reading(path):
         return path.read_bytes()
-    except OSError as error:
-        raise PoiseError(
-            f"the file cannot be read ({error.strerror})", path, code="file-unreadable"
-        ) from None
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -119,38 +122,31 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     check_file(path, limit)
     chunks: list[bytes] = []
     run, line, total = 0, 1, 0
-    try:
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                if total == 0:
-                    chunk = _without_mark(chunk, path)
-                total += len(chunk)
-                if total > limit:
-                    raise PoiseError(
-                        "the file grew beyond the limit while it was read", path, code="file-too-big"
-                    )
-                nul = chunk.find(b"\0")
-                if nul >= 0:
-                    place = at_line(path, line + chunk.count(b"\n", 0, nul))
-                    raise PoiseError("binary data in a text file", place, code="not-text")
-                first, last = _breaks(chunk)
-                if run + first > MAX_LINE_BYTES:
-                    raise PoiseError(
-                        f"the line is longer than {MAX_LINE_BYTES / 1e6:.1f} MB, which no frame needs",
-                        at_line(path, line),
-                        code="over-limit",
-                    )
-                run = len(chunk) - last - 1 if last >= 0 else run + len(chunk)
-                line += chunk.count(b"\n") + chunk.count(b"\r") - chunk.count(b"\r\n")
-                if line > MAX_LINES:
-                    raise PoiseError(
-                        f"the file has more than {MAX_LINES} lines", path, code="over-limit"
-                    )
-                chunks.append(chunk)
-    except OSError as error:
-        raise PoiseError(
-            f"the file cannot be read ({error.strerror})", path, code="file-unreadable"
-        ) from None
+    with _reading(path), path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            if total == 0:
+                chunk = _without_mark(chunk, path)
+            total += len(chunk)
+            if total > limit:
+                raise PoiseError(
+                    "the file grew beyond the limit while it was read", path, code="file-too-big"
+                )
+            nul = chunk.find(b"\0")
+            if nul >= 0:
+                place = at_line(path, line + chunk.count(b"\n", 0, nul))
+                raise PoiseError("binary data in a text file", place, code="not-text")
+            first, last = _breaks(chunk)
+            if run + first > MAX_LINE_BYTES:
+                raise PoiseError(
+                    f"the line is longer than {MAX_LINE_BYTES / 1e6:.1f} MB, which no frame needs",
+                    at_line(path, line),
+                    code="over-limit",
+                )
+            run = len(chunk) - last - 1 if last >= 0 else run + len(chunk)
+            line += chunk.count(b"\n") + chunk.count(b"\r") - chunk.count(b"\r\n")
+            if line > MAX_LINES:
+                raise PoiseError(f"the file has more than {MAX_LINES} lines", path, code="over-limit")
+            chunks.append(chunk)
     return b"".join(chunks)
 
 

@@ -31,7 +31,7 @@ from poise.motion.info import landmarks
 from poise.motion.rotations import normalize, quat_mul, quat_rotate, unwrap_quats
 
 _EVEN_SCALE = 1e-2
-_SCRIPT = Path(__file__).with_name("stage.py")
+_SCRIPT = Path(__file__).with_name("usd_stage.py")
 
 
 def pxr_package() -> Any:

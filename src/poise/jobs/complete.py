@@ -7,7 +7,7 @@ done.clip, done.card, done.stages, done.save("out")
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +15,19 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.formats import home_suffix, write_clip
-from poise.jobs.deliver import Delivery, StageMotion, key_errors, stage_of
-from poise.jobs.inbetween.fill import Inbetweened, inbetween
+from poise.jobs.deliver import key_errors, stage_of
+from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.open import open_run
-from poise.jobs.result import Result, ResultView, clip_of
-from poise.jobs.track import TrackConfig, Tracked, track, write
-from poise.jobs.track.controllers import Merit
+from poise.jobs.result import Merit, Result, clip_of, story
+from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.direction import Weight
-from poise.jobs.track.rates import InPlace, with_travel
-from poise.jobs.track.tracked import story
+from poise.jobs.track.in_place import with_travel
 from poise.jobs.tracker import Tracker
 from poise.kinematics import without_noise
 from poise.kinematics.rate import judge_rate
-from poise.learn.inbetween import InbetweenModel
+from poise.learn.inbetween_model import InbetweenModel
 from poise.motion import Clip
 from poise.plan import LookaheadConfig
-from poise.score import ScoreCard
 from poise.settings import changed
 from poise.synthesis.filler import check_keyframes
 from poise.synthesis.inbetween import Partial, Retiming, moved_to, retimed, timed
@@ -48,78 +45,26 @@ ROUNDS, LONGER, MET_M = 6, 1.3, 0.1
 Show = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Completed(Result):
-    """What came of keyframes.
+def met(result: Result) -> str:
+    """How a body met its keyframes, in a sentence."""
+    off, became = result.met_mm, story(result, hint=False)
+    if became.failed:
+        return became.sentence
+    worst = int(np.argmax(off))
+    told = (
+        f"Without help; keyframes met to {np.mean(off):.0f} mm on average, frame "
+        f"{result.keyframes[worst]} worst with {off[worst]:.0f} mm"
+    )
+    if off[worst] <= 1000 * MET_M:
+        return f"{told}."
+    return f"{told}, which is missed: more keyframes, --retime or --controller search may help."
 
-    Attributes:
-        source: what came in, without a tremble, on the times that were asked for.
-        keyframes: frames that are kept, as they were asked for.
-        filled: the kinematic stage, on the times of the result.
-        tracked: the physical stage.
-        at: frames of the result at which each keyframe is; `keyframes` unless times were changed.
-        met_mm: how far the body's joints are from each keyframe, mean, in the world.
-        stages: figures of each stage.
-        retiming: what was done to the times; None where nothing was.
-    """
 
-    source: Clip
-    keyframes: tuple[int, ...]
-    filled: Inbetweened
-    tracked: Tracked
-    at: tuple[int, ...]
-    met_mm: tuple[float, ...]
-    stages: tuple[StageMotion, ...]
-    retiming: Retiming | None
-
-    @property
-    def card(self) -> ScoreCard:
-        """The score of the simulation against the filled motion, help 0."""
-        return self.tracked.card
-
-    @property
-    def clip(self) -> Clip:
-        """The body's motion on the skeleton that came in."""
-        return self.tracked.clip
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is doubtful, and what was done, in sentences."""
-        said = () if self.retiming is None else (self.retiming.sentence(),)
-        return (*self.filled.notes, *said, *self.tracked.notes)
-
-    @property
-    def sentence(self) -> str:
-        """How the keyframes were met."""
-        worst = int(np.argmax(self.met_mm))
-        became = story(self.tracked, hint=False)
-        if became.failed:
-            return became.sentence
-        told = (
-            f"Without help; keyframes met to {np.mean(self.met_mm):.0f} mm on average, frame "
-            f"{self.keyframes[worst]} worst with {self.met_mm[worst]:.0f} mm"
-        )
-        if self.met_mm[worst] <= 1000 * MET_M:
-            return f"{told}."
-        return f"{told}, which is missed: more keyframes, --retime or --controller search may help."
-
-    def _shown(self) -> ResultView:
-        travel, filled = self.tracked.travel, self.filled.clip
-        filled = filled if travel is None else travel.written(filled)
-        return ResultView(self.clip, filled, self.card, self.notes, self.at)
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        return self.write(folder).paths
-
-    def write(self, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
-        """Writes what `track` writes, with the keyframes in the report, and the filled motion beside it
-        as `filled.bvh`, or in the format of the source."""
-        said = (self.sentence, *(s.sentence() for s in self.stages))
-        done = write(self.tracked, out, motion, hold, keys=self.at, said=said)
-        filled, clip = out / f"filled{home_suffix(self.filled.clip)}", self.filled.clip
-        travel = self.tracked.travel
-        write_clip(clip if travel is None else travel.written(clip), filled)
-        return replace(done, paths={**done.paths, "filled": filled})
+def write_filled(result: Result, out: Path, _motion: Path, _hold: bool) -> dict[str, Path]:
+    """Writes the motion that was given a body as `filled.bvh`, or in the format of the source."""
+    path = out / f"filled{home_suffix(result.came)}"
+    write_clip(result.came, path)
+    return {"filled": path}
 
 
 def complete(
@@ -136,7 +81,7 @@ def complete(
     progress: Show | None = None,
     warn: Callable[[str], None] | None = None,
     **settings: Any,
-) -> Completed:
+) -> Result:
     """Makes a motion of keyframes, and gives it a body: in-betweening, then a simulated character.
 
     The motion between the keyframes is made by a network (`inbetween`); the policy with lookahead does
@@ -194,7 +139,7 @@ def complete(
         source, keys = timed(source, keys, times)
     more: dict[str, Any] = {} if adapt is None else {"adapt": adapt}
     factors = np.ones(len(keys) - 1)
-    best: tuple[Merit, Completed] | None = None
+    best: tuple[Merit, Result] | None = None
     for round_ in range(ROUNDS if retime else 1):
         stretched, at = retimed(source, keys, factors)
         told = None if progress is None else _telling(progress, "filling")
@@ -209,11 +154,26 @@ def complete(
         tracked = track(
             filled.clip, tracker, replace(how, direction=direction), progress=progress, warn=warn
         )
-        more_said = (*said, *(() if doubt is None or doubt in tracked.notes else (doubt,)))
-        tracked = replace(tracked, notes=(*more_said, *tracked.notes))
-        done = _completed(source, keys, filled, tracked, at, factors)
-        retiming = done.retiming and replace(done.retiming, called=asked)
-        done = replace(done, keyframes=asked, retiming=retiming)
+        made = {
+            "filled": filled.clip, "simulated": tracked.delivered(hold=False), "delivered": tracked.clip,
+        }  # fmt: skip
+        off = {name: key_errors(clip, source, keys, at) for name, clip in made.items()}
+        told_times = None
+        if not (factors == 1.0).all():
+            told_times = Retiming(keys, at, source.fps, tuple(factors.tolist()), called=asked)
+        before = (*filled.notes, *(() if told_times is None else (told_times.sentence(),)))
+        first = (*said, *(() if doubt is None or doubt in tracked.notes else (doubt,)))
+        done = replace(
+            tracked,
+            notes=(*before, *first, *tracked.notes),
+            filled=filled.filled,
+            came=filled.clip,
+            keyframes=asked,
+            at=at,
+            met_mm=off["simulated"],
+            stages=tuple(stage_of(name, clip, off[name]) for name, clip in made.items()),
+            retiming=told_times,
+        )
         # As attempts are compared everywhere, but that keyframes are to be met and not all frames alike.
         merit = tracked.merit._replace(error=-float(np.mean(done.met_mm)))
         if best is None or merit > best[0]:
@@ -223,7 +183,13 @@ def complete(
             break
         factors = np.where(slow, LONGER * factors, factors)
     assert best is not None
-    return best[1] if travel is None else _as_it_came(best[1], travel)
+    done = best[1]
+    if travel is not None:
+        # What came of a clip in place is written as it came.
+        notes = (travel.sentence(), *done.notes)
+        done = replace(done, travel=travel, notes=notes, came=travel.written(done.came))
+    report = (met(done), *(s.sentence() for s in done.stages))
+    return replace(done, said=report, beside=(*done.beside, write_filled))
 
 
 def _calm(clip: Clip) -> tuple[Clip, tuple[str, ...]]:
@@ -238,39 +204,14 @@ def _calm(clip: Clip) -> tuple[Clip, tuple[str, ...]]:
     return calm.replaced(skeleton=calm.skeleton.with_source(raw=True)), tuple(cleaned.noise_sentences())
 
 
-def _as_it_came(done: Completed, travel: InPlace) -> Completed:
-    """What came of a clip in place, written as it came."""
-    tracked = replace(done.tracked, travel=travel, notes=(travel.sentence(), *done.tracked.notes))
-    return replace(done, tracked=tracked)
-
-
-def _completed(
-    source: Clip,
-    keys: tuple[int, ...],
-    filled: Inbetweened,
-    tracked: Tracked,
-    at: tuple[int, ...],
-    factors: np.ndarray,
-) -> Completed:
-    made = {
-        "filled": filled.clip, "simulated": tracked.delivered(hold=False), "delivered": tracked.clip,
-    }  # fmt: skip
-    off = {name: key_errors(clip, source, keys, at) for name, clip in made.items()}
-    stages = tuple(stage_of(name, clip, off[name]) for name, clip in made.items())
-    retiming = (
-        None if (factors == 1.0).all() else Retiming(keys, at, source.fps, tuple(factors.tolist()))
-    )
-    return Completed(source, keys, filled, tracked, at, off["simulated"], stages, retiming)
-
-
-def _too_fast(done: Completed) -> np.ndarray:
+def _too_fast(done: Result) -> np.ndarray:
     """`(gaps,)` bool, those that the body did not do in their time."""
     over = np.array(done.filled.over) > 1.0
     missed = np.array(done.met_mm) > 1000 * MET_M
     late = missed[1:] | (missed[:-1] & (np.arange(len(missed) - 1) > 0))
     out = over | late
-    for _, seconds in done.tracked.failures:
-        frame = seconds * done.source.fps
+    for _, seconds in done.failures:
+        frame = seconds * done.came.fps
         gap = int(np.clip(np.searchsorted(done.at, frame) - 1, 0, len(out) - 1))
         out[gap] = True
     return out

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from poise.formats import home_suffix, write_clip
-from poise.jobs.runs import Evaluation
+from poise.formats import home_suffix
 from poise.kinematics import anatomy_of, examine, hold_feet, lowest_height, qpos_to_clip, support_of
 from poise.kinematics.feet import stands_higher
 from poise.kinematics.hold import FASTEST, mend_slides
@@ -23,14 +22,27 @@ from poise.metrics import jerk, success
 from poise.motion import Clip, ground_shift, resample
 from poise.motion.clip import blended
 from poise.recipes.imitation import Imitation
-from poise.score import Recording, RolloutSet, ScoreCard, clip_figures, write_score
-from poise.score.report import Report, Shape, Track, write_report
+from poise.score import Recording, RolloutSet, ScoreCard, clip_figures
+from poise.score.report import Report, Shape, Track
 from poise.sim.props import Box
 from poise.version import __version__
 
 #: By how much the largest jerk may grow with a foot that is held; s around where it slides that are
 #: looked at; how often what is rougher is left out.
 ROUGHER, AROUND_S, ROUNDS = 1.25, 0.5, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What a policy did: the score card, the padded rollouts, one whole episode per clip.
+
+    together: whether these are characters of one world.
+    """
+
+    card: ScoreCard
+    rollouts: RolloutSet
+    recordings: list[Recording]
+    together: bool = False
 
 
 def as_file(clip: Clip) -> Clip:
@@ -186,7 +198,7 @@ def finished(
     undirected: Clip | None = None,
 ) -> Delivery:
     """The simulated motion of every clip, its standing feet held to the spot, as high as its source; see
-    `deliver`.
+    `Result.write`.
 
     Args:
         undirected: the motion before pins and touch points led it, beside which the doctor's findings
@@ -226,55 +238,6 @@ def finished(
         raised = float(high.root_pos[0, 2] - clip.root_pos[0, 2])
         notes += _floor_told(clip.name, raised)
     return Delivery(clips, homes, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
-
-
-def deliver(
-    imitation: Imitation,
-    evaluation: Evaluation,
-    out: Path,
-    curve: dict[str, np.ndarray],
-    motion: Path | None = None,
-    hold: bool = True,
-    source: Clip | None = None,
-    said: tuple[str, ...] = (),
-    keys: tuple[int, ...] = (),
-    lost: tuple[float, ...] | None = None,
-    home: Home | None = None,
-    done: Delivery | None = None,
-) -> Delivery:
-    """Writes the motion, `score.json` and `report.html` into `out`.
-
-    The motion is `simulated.bvh`, or has the suffix of its source's format, see `home_suffix`. A library
-    gets one `simulated_<clip>` file per clip; the report shows the first clip.
-
-    Args:
-        motion: the file for a single clip's motion, in the format of its suffix, in place of that in
-            `out`.
-        hold: standing feet are held to the spot (`kin.hold_feet`): contacts of a simulation are soft,
-            so soles creep, rock and sink by millimetres. Score and report show the simulation itself;
-            what holding did stands in them as well.
-        source: see `make_report`.
-        said: sentences that the report begins with.
-        keys: frames of the source that stay visible in the report.
-        lost: s, when the first clip was lost; by default as the score's rule judges its episode.
-        home: of a body that is not the skeleton that came in; what is written here is on the body's.
-        done: what `finished` came to, where that is known.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    paths: dict[str, Path] = {}
-    done = done or finished(imitation, evaluation, hold, source, home)
-    for name, clip in done.clips.items():
-        single = len(done.clips) == 1
-        paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"
-        write_clip(clip, paths[name])
-    paths["score"] = write_score(done.card, out / "score.json")
-    paths["report"] = out / "report.html"
-    report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
-    frames = tuple(round(k / (source or imitation.library.clips[0]).fps * report.fps) for k in keys)
-    report = replace(report, notes=(*said, *report.notes, *done.notes), keys=frames)
-    report = report if lost is None else replace(report, lost=lost)
-    write_report(report, paths["report"])
-    return replace(done, paths=paths)
 
 
 def _held(

@@ -13,112 +13,26 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from poise.errors import PoiseError
-from poise.jobs.deliver import Delivery, deliver, finished
-from poise.jobs.keep import claimed
+from poise.jobs.keep import EVALUATING, claimed
 from poise.jobs.open import Run, open_run
-from poise.jobs.practice import EVALUATING, Watching, practise
-from poise.jobs.result import Result, ResultView, clip_of
-from poise.jobs.run_file import learning_curve
-from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
-from poise.jobs.track import Tracked, write
-from poise.jobs.track.rates import with_travel
-from poise.jobs.track.settings import Mode
+from poise.jobs.practice import Watching, practise
+from poise.jobs.result import RUN, Result, clip_of
+from poise.jobs.runs import begin, evaluate, train, trained_policy
+from poise.jobs.track.in_place import with_travel
+from poise.jobs.track_settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
-from poise.learn import IterationStats, PolicyBundle, RunResult, Until
+from poise.learn import IterationStats, RunResult, Until
 from poise.learn.parallel import ALONE, Comm, joined, share_of, together
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.score import ScoreCard
 from poise.settings import changed
-
-#: The run folder in a result folder.
-RUN = "run"
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Imitated(Result):
-    """The result of an imitation.
-
-    Attributes:
-        task: the motion with its body.
-        policy: the trained one.
-        evaluation: every start frame simulated.
-        run: the run folder.
-        interrupted: whether Ctrl-C ended the training early; it was evaluated all the same.
-        tracked: what is kept, the best of what policy, lookahead and search do, where a policy began;
-            else None.
-        sentences: what is said of that beside `track.story`.
-    """
-
-    task: Imitation
-    policy: PolicyBundle
-    evaluation: Evaluation
-    run: Path
-    interrupted: bool = False
-    tracked: Tracked | None = None
-    sentences: tuple[str, ...] = ()
-
-    @cached_property
-    def _finished(self) -> Delivery:
-        return finished(self.task, self.evaluation)
-
-    @property
-    def clips(self) -> tuple[Clip, ...]:
-        """The simulated motion of every clip, standing feet held."""
-        if self.tracked is not None:
-            return (self.tracked.clip,)
-        return tuple(self._finished.clips.values())
-
-    @property
-    def clip(self) -> Clip:
-        """The simulated motion of the first clip."""
-        return self.clips[0]
-
-    @property
-    def card(self) -> ScoreCard:
-        """The score of all start frames."""
-        return self._finished.card if self.tracked is None else self.tracked.card
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences on repairs of the motion and on feet that were held."""
-        own = [n for clip in self.task.library for n in clip.skeleton.source.notes]
-        if self.tracked is not None:
-            own += [*self.sentences, *self.tracked.notes]
-            travel = self.tracked.travel
-            own += [] if travel is None or travel.sentence() in own else [travel.sentence()]
-        return (*own, *self.task.report.sentences(), *self._finished.notes)
-
-    def _shown(self) -> ResultView:
-        source = self.tracked.placed.source if self.tracked else self.task.library.clips[0]
-        if self.tracked is not None and self.tracked.travel is not None:
-            source = self.tracked.travel.beside
-        return ResultView(self.clip, source, self.card, self.notes)
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        paths = self.deliver(folder).paths
-        kept = folder / RUN
-        if kept.resolve() != self.run.resolve():
-            shutil.copytree(self.run, kept, dirs_exist_ok=True)
-        return paths | {"run": kept}
-
-    def deliver(self, folder: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
-        """Writes motion, score and report into `folder`, see `deliver.deliver`.
-
-        motion: the file of the motion, in place of one in `folder`. hold: standing feet are held.
-        """
-        curve = learning_curve(self.run)
-        if self.tracked is not None:
-            return write(self.tracked, folder, motion, hold, curve)
-        return deliver(self.task, self.evaluation, folder, curve, motion, hold)
 
 
 def imitate(
@@ -135,7 +49,7 @@ def imitate(
     callbacks: TrainingCallbacks | None = None,
     in_place: Mode = "auto",
     **settings: Any,
-) -> Imitated:
+) -> Result:
     """Trains a policy on a motion, simulates it from every start frame, and scores it.
 
     By default a policy that knows many motions learns this one, on its own joints with the bones of the
@@ -188,6 +102,11 @@ def imitate(
             shutil.rmtree(run, ignore_errors=True)
         raise
     assert made is not None
+    own = [n for clip in made.imitation.library for n in clip.skeleton.source.notes]
+    own += [*made.sentences, *made.notes]
+    travel = None if made.travel is None else made.travel.sentence()
+    own += [] if travel is None or travel in own else [travel]
+    made = replace(made, notes=(*own, *made.imitation.report.sentences()))
     if folder is None:
         weakref.finalize(made, shutil.rmtree, made.run, True)
     return made
@@ -228,7 +147,7 @@ class Job:
 
     def done(
         self, policy: Tracker | Run | str | Path | None = None, nothing: bool = False
-    ) -> Imitated | None:
+    ) -> Result | None:
         """The result for the clips; None on every process of `torchrun` but the first.
 
         nothing: no policy begins.
@@ -248,9 +167,9 @@ class Job:
         with self.told.doing(EVALUATING):
             net, meta = trained_policy(self.run, task)
             evaluation = evaluate(task, net, meta, device=self.device)
-        return Imitated(task, net, evaluation, self.run, result.interrupted)
+        return Result(task, evaluation, policy=net, run=self.run, interrupted=result.interrupted)
 
-    def _practised(self, policy: Tracker | Run | str | Path | None) -> Imitated | None:
+    def _practised(self, policy: Tracker | Run | str | Path | None) -> Result | None:
         """The result by a policy; None if the one that comes with Poise does not fit."""
         (clip,) = self.read()
         self.told.given(ClipLibrary.of(clip))
@@ -279,8 +198,13 @@ class Job:
             )
         if made.tracked is None:
             raise KeyboardInterrupt
-        t, own, result = made.tracked, made.learned.tracker.policy, made.learned.result
-        return Imitated(t.imitation, own, t.evaluation, self.run, result.interrupted, t, made.sentences)
+        return replace(
+            made.tracked,
+            policy=made.learned.tracker.policy,
+            run=self.run,
+            sentences=made.sentences,
+            interrupted=made.learned.result.interrupted,
+        )
 
     def learned(self) -> tuple[Imitation, RunResult, int]:
         """The clips learned from nothing: the task, how its training ended, this process's rank."""

@@ -22,10 +22,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual.stage_order import Progress
+from poise.jobs.perpetual.stages import Progress
+from poise.jobs.result import LOST, TRACKED, Result
 from poise.jobs.run_file import RUN_FILE
-from poise.jobs.track import TrackConfig, Tracked, track
-from poise.jobs.track.controllers import LOST, TRACKED
+from poise.jobs.track import TrackConfig, track
+from poise.jobs.track.in_place import InPlace, with_travel
 from poise.jobs.track.learning import (
     GRAVITY,
     SHARES,
@@ -37,8 +38,7 @@ from poise.jobs.track.learning import (
     with_help,
 )
 from poise.jobs.track.placement import place
-from poise.jobs.track.rates import InPlace, with_travel
-from poise.jobs.track.settings import Mode
+from poise.jobs.track_settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, Until
@@ -47,8 +47,6 @@ from poise.recipes.imitation import Imitation
 
 #: Start frames from which a motion is to be done before its training ends.
 STARTS = 32
-#: What `Watching.doing` is told last.
-EVALUATING = "simulating every start frame"
 #: The share of the minutes that training has at least, whatever looking for the motion takes.
 LEAST = 0.5
 
@@ -70,8 +68,8 @@ class Watching:
         stats: each iteration there; False ends the training.
     """
 
-    follow: Callable[[Tracker, Clip, TrackConfig], Tracked] = lambda t, c, how: track(c, t, how)
-    first: Callable[[Tracked], None] = lambda _: None
+    follow: Callable[[Tracker, Clip, TrackConfig], Result] = lambda t, c, how: track(c, t, how)
+    first: Callable[[Result], None] = lambda _: None
     say: Callable[[str], None] = lambda _: None
     iteration: Callable[[Progress], bool | None] = lambda _: None
     doing: Callable[[str], AbstractContextManager[Any]] = lambda _: nullcontext()
@@ -89,12 +87,12 @@ class Practised(NamedTuple):
         tracked: what is kept; None where Ctrl-C ended the training.
         learned: the policy as far as it came, and how its run ended.
         first: what was done before anything was learned; None where a run went on.
-        sentences: what is to be said of it beside `track.story`.
+        sentences: what is to be said of it beside `story`.
     """
 
-    tracked: Tracked | None
+    tracked: Result | None
     learned: LearnedMotion
-    first: Tracked | None
+    first: Result | None
     sentences: tuple[str, ...] = ()
 
 
@@ -150,7 +148,7 @@ def practise(
     return _best(clip, tracker, learned, first, newtons, config, device, told, travel)
 
 
-def _in_place(tracked: Tracked, travel: InPlace | None) -> Tracked:
+def _in_place(tracked: Result, travel: InPlace | None) -> Result:
     """The simulation of a clip in place, to be written as it came."""
     return tracked if travel is None else replace(tracked, travel=travel)
 
@@ -160,9 +158,7 @@ def _moving(clip: Clip, travel: InPlace | None) -> Clip:
     return clip if travel is None else travel.clip
 
 
-def _help(
-    tracker: Tracker, first: Tracked, seed: int, threads: int, say: Callable[[str], None]
-) -> float:
+def _help(tracker: Tracker, first: Result, seed: int, threads: int, say: Callable[[str], None]) -> float:
     """The help with which a motion that was lost is learned, N; 0 where none suffices."""
     newtons = help_wanted(tracker, first.placed, seed, threads)
     if newtons is None:
@@ -189,7 +185,7 @@ def _best(
     clip: Clip,
     tracker: Tracker,
     learned: LearnedMotion,
-    first: Tracked | None,
+    first: Result | None,
     newtons: float,
     config: TrackConfig,
     device: str,

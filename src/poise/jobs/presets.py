@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.endless.training import Endless
-from poise.jobs.inbetween.settings import Inbetween, small
+from poise.jobs.endless.endless_training import Endless
+from poise.jobs.inbetween.inbetween_settings import Inbetween, small
 from poise.motion import Clip
-from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.perpetual_settings import BY_STAGES
 from poise.recipes.residual_force_settings import ResidualForce
+from poise.settings import imported
 
 #: The names of presets.
 NAMES = ("paper", "code", "fast")
@@ -20,8 +21,8 @@ _PRESETS: dict[str, dict[str, Callable[..., Any]]] = {
         "paper": ResidualForce.paper, "code": ResidualForce.code, "fast": lambda _: ResidualForce(),
     },
     "perpetual": {
-        "paper": lambda _: Perpetual.paper(), "code": lambda _: Perpetual.code(),
-        "fast": lambda _: Perpetual.additive(),
+        name: lambda _, made=made: getattr(imported(BY_STAGES), made)()
+        for name, made in (("paper", "paper"), ("code", "code"), ("fast", "additive"))
     },
     "inbetween": {
         "paper": lambda _: Inbetween.paper(), "code": lambda _: Inbetween.code(),

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from poise.jobs.open import Run
-from poise.jobs.track import TrackConfig, Tracked, track
+from poise.jobs.result import Result
+from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.controllers import Show
 from poise.jobs.track.pushed import PushConfig
 from poise.jobs.tracker import Tracker
@@ -26,11 +27,11 @@ def push(
     *,
     progress: Show | None = None,
     **settings: Any,
-) -> Tracked:
+) -> Result:
     """Lets a trained policy do a motion while something pushes it, without help and without training.
 
     The character gives way: its goal is displaced where it is pushed, and comes back afterwards. What
-    comes back is what `poise.track` gives, with `Tracked.pushed`.
+    comes back is what `poise.track` gives, with `Result.pushed`.
 
     Args:
         clip: a clip, or the file of one.

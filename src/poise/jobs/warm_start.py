@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor
 
+from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
 from poise.learn import (
     LATEST,
@@ -31,7 +32,7 @@ from poise.learn.checkpoint import PolicyMeta
 from poise.learn.networks import RunningNorm
 from poise.learn.parallel import ALONE, Comm, any_of, together
 from poise.learn.policy import spread
-from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
+from poise.plan import Expert, Plan, make_plan
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import pushed, stage_task
 from poise.score import ScoreCard, run_episodes, score_rollouts, start_frames
@@ -59,14 +60,15 @@ class TrainingCallbacks:
         round: each round of cloning.
         cloned: the clone, once it is saved.
         failed: why the run begins without an expert.
-        path: each iteration of a trajectory optimisation, and how many there are.
+        path: each iteration of a trajectory optimisation, as `papers.perpetual.trajopt` states it, and
+            how many there are.
     """
 
     expert: Callable[[ScoreCard], None] | None = None
     round: Callable[[CloneStats], None] | None = None
     cloned: Callable[[PolicyBundle, WarmStart], None] | None = None
     failed: Callable[[str], None] | None = None
-    path: Callable[[TrajOptStats, int], None] | None = None
+    path: Callable[[Any, int], None] | None = None
 
 
 def start_training(
@@ -123,15 +125,15 @@ def clone_expert(
     tell: TrainingCallbacks | None = None,
     config: CloneConfig | None = None,
     start: PolicyBundle | None = None,
-    paths: Trajectories | None = None,
+    acts: Callable[[ImitationEnv], Acts] | None = None,
 ) -> WarmStart:
     """Scores the expert and clones it into a policy of the recipe's networks and observation.
 
     Args:
         start: the policy that is taught, see `learn.clone`; a new perceptron by default.
-        paths: what the teacher follows in place of the expert, without help.
+        acts: makes a teacher in place of the expert, which needs no help.
     """
-    tell, plan = tell or TrainingCallbacks(), None if paths else make_plan(imitation.reference)
+    tell, plan = tell or TrainingCallbacks(), None if acts else make_plan(imitation.reference)
     if tell.expert is not None and plan is not None:
         tell.expert(score_expert(imitation, plan))
     worlds = min(imitation.config.num_envs, CLONE_WORLDS)
@@ -141,7 +143,7 @@ def clone_expert(
     try:
         return clone(
             cast(VecEnv, env),
-            LqrTeacher(env, paths) if paths else Expert(env, plan=plan),
+            acts(env) if acts else Expert(env, plan=plan),
             config,
             imitation.ppo(),
             imitation.config.seed,

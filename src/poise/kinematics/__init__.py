@@ -9,7 +9,7 @@ from poise.kinematics.hold import hold_feet
 from poise.kinematics.ik import analytic_ik, clip_ik, polish
 from poise.kinematics.ik_body import IkBody, ik_body
 from poise.kinematics.ik_frames import CORRECTIONS, IkConfig
-from poise.kinematics.limbs import limb_of, match_positions, two_bone
+from poise.kinematics.limbs import limb_of, match_positions
 from poise.kinematics.loops import close_cycle, cycle_step, cycle_velocity
 from poise.kinematics.place import place_on_body
 from poise.kinematics.repair.doctor import Examination, examine, heal, without_noise
@@ -68,7 +68,6 @@ __all__ = [
     "sole_slide",
     "support_of",
     "swap_sides",
-    "two_bone",
     "with_rest_pose",
     "without_noise",
 ]

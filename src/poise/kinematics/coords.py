@@ -12,9 +12,9 @@ from torch import Tensor
 from poise.body import BodyTable, Humanoid
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 from poise.motion.rotations import (
     euler_to_quat,
-    forward_kinematics,
     normalize,
     quat_between,
     quat_conj,
@@ -174,7 +174,7 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
             clip.name,
             code="skeleton-differs",
         )
-    pos, quat = forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *clip.tensors())
+    pos, quat = skeleton.forward(*clip.tensors())
     pelvis = rows[0].joint
     columns = [pos[:, pelvis], unwrap_quats(quat[:, pelvis])]
     for row in rows[1:]:
@@ -184,6 +184,74 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
         rot = quat_between(rest, rel)
         columns.append(chain_angles(rot, row.order, torch.tensor(row.frame, dtype=torch.float64)))
     return torch.cat(columns, -1).numpy()
+
+
+class Hinges:
+    """A body's coordinates of one frame, its hinges continuous from one frame to the next.
+
+    The twin that knows all frames is `clip_to_qpos`.
+    """
+
+    def __init__(self, skeleton: Skeleton, table: BodyTable):
+        self.skeleton, self.rows = skeleton, table.rows
+        pelvis = self.rows[0].joint
+        self._pelvis = (*skeleton.ancestors(pelvis)[::-1], pelvis)
+        driven = [r for r in self.rows[1:] if r.order]
+        self._joints = np.array([r.joint for r in driven])
+        self._anchors = np.array([self.rows[r.parent].joint for r in driven])
+        self._rest = np.array([r.quat for r in driven])
+        self._frame = np.array([r.frame for r in driven])
+        single, euler, column = list[tuple[int, int, int]](), list[tuple[int, ...]](), 0
+        for k, row in enumerate(driven):
+            n = len(row.order)
+            if n == 1:
+                single.append((k, "XYZ".index(row.order), column))
+            else:
+                order = row.order
+                if n == 2:
+                    order = order[0] + next(c for c in "XYZ" if c not in order) + order[1]
+                i, j, l_ = ("XYZ".index(c) for c in order)
+                euler.append((k, i, j, l_, column, n))
+            column += n
+        self._single = np.array(single, dtype=int).reshape(-1, 3).T
+        self._two, self._three = (
+            np.array([e[:5] for e in euler if e[5] == n], dtype=int).reshape(-1, 5).T for n in (2, 3)
+        )
+        self.count = column
+
+    def __call__(self, root: np.ndarray, world: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+        """`(7 + n)` for the root `(3)` m and the world rotations of all joints.
+
+        before: `(n)` rad, the hinges of the frame before; None takes those nearest to 0.
+        """
+        out = np.empty(7 + self.count)
+        above, below = list(self._pelvis[:-1]), list(self._pelvis[1:])
+        out[:3] = root + q.rotate(world[above], self.skeleton.offsets[below]).sum(0)
+        out[3:7] = world[self._pelvis[-1]]
+        rel = q.between(world[self._anchors], world[self._joints])
+        local = q.mul(q.between(self._frame, q.between(self._rest, rel)), self._frame)
+        m, angles = q.matrix(local), np.zeros(self.count)
+        last = np.zeros(self.count) if before is None else before
+        k, axis, at = self._single
+        angles[at] = 2.0 * np.arctan2(local[k, 1 + axis], local[k, 0])
+        a, _, c = _euler(m, *self._two[:4])
+        angles[self._two[4]], angles[self._two[4] + 1] = a, c
+        at = self._three[4] + np.arange(3)[:, None]
+        first = np.stack(_euler(m, *self._three[:4]))
+        second = np.stack((first[0] + np.pi, np.pi - first[1], first[2] + np.pi))
+        near, far = (np.square(wrapped(x - last[at])).sum(0) for x in (first, second))
+        angles[at] = np.where(near <= far, first, second)
+        out[7:] = last + wrapped(angles - last)
+        return out
+
+
+def _euler(
+    m: np.ndarray, k: np.ndarray, i: np.ndarray, j: np.ndarray, l_: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The angles `(n)` of turns `m[k]` about axes i, then j, then l."""
+    e = np.where((j - i) % 3 == 1, 1.0, -1.0)
+    b = np.arcsin(np.clip(e * m[k, i, l_], -1.0, 1.0))
+    return np.arctan2(-e * m[k, j, l_], m[k, l_, l_]), b, np.arctan2(-e * m[k, i, j], m[k, i, i])
 
 
 def qpos_to_clip(

@@ -11,12 +11,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from poise.body import BodyTable
-from poise.body.table import BodyRow, Geom
+from poise.body import BodyTable, find_anatomy
+from poise.body.body_table import BodyRow, Geom
+from poise.errors import PoiseError
 from poise.kinematics.forward import carried
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
-from poise.motion import Clip
-from poise.motion.rotations import quat_between, quat_conj, quat_mul, quat_rotate, shortest_arc
+from poise.motion import Clip, Skeleton
+from poise.motion.rotations import (
+    quat_between,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    shortest_arc,
+)
 from poise.motion.smoothing import find_runs
 
 #: m/s: a point that touches is slower than the first; a whole foot that stands, than the second.
@@ -37,6 +44,10 @@ BEARS_M, CLEAR_M = 0.015, 0.03
 DRAG_M, DRAG_SPEED = 0.15, 0.3
 #: Time (s) for which a sole that bears before and after may stop doing so.
 REST_GAP_S = 0.07
+
+
+#: Root `(T, 3)` m and rotations `(T, J, 4)`.
+Motion = tuple[Tensor, Tensor]
 
 
 class Sole(NamedTuple):
@@ -202,6 +213,43 @@ def dragged(sole: Sole, weight: Tensor, fps: float) -> Tensor:
         seconds = (last - first + 1) / fps
         out[first : last + 1] = travel > DRAG_M and travel / seconds > DRAG_SPEED
     return out
+
+
+#: m under the floor from which on a frame is no longer a foot that sank in.
+UNDER_M = 0.1
+
+
+def joint_heights(skeleton: Skeleton, motion: Motion) -> Tensor:
+    """`(T, J)` m of all joints."""
+    return skeleton.forward(*motion)[0][..., 2]
+
+
+def off_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
+    """`(T,)` m, how much higher the lowest joint is than in the frames that stand, of all given."""
+    low = joint_heights(skeleton, motion).amin(-1)
+    return low - low.quantile(0.1)
+
+
+def standing_heights(skeleton: Skeleton, motion: Motion) -> tuple[float, float]:
+    """m, how high the ankle and the toes are of the lower foot, in most frames; 0 without feet."""
+    try:
+        anatomy = find_anatomy(skeleton)
+    except PoiseError:
+        return 0.0, 0.0
+    ankles, toes = anatomy.of("foot"), [toe for _, toe in anatomy.toes]
+    if not ankles or not toes:
+        return 0.0, 0.0
+    height = joint_heights(skeleton, motion)
+    ankle, toe = (float(height[:, list(x)].amin(-1).quantile(LOWEST_SHARE)) for x in (ankles, toes))
+    return ankle, toe
+
+
+def under_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
+    """`(T,)` m that the lowest joint lies under the floor at 0; 0 where it does not, or where most
+    frames lie as low, since their floor then is elsewhere."""
+    low = joint_heights(skeleton, motion).amin(-1)
+    deep = (low < -UNDER_M) & (low < low.median() - UNDER_M)
+    return torch.where(deep, -low, torch.zeros_like(low))
 
 
 #: Frames of standing from which something is known.

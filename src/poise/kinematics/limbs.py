@@ -16,7 +16,6 @@ from poise.motion import Skeleton
 from poise.motion.rotations import (
     across,
     axis_angle_to_quat,
-    forward_kinematics,
     normalize,
     quat_between,
     quat_mul,
@@ -24,7 +23,7 @@ from poise.motion.rotations import (
     quat_rotate_inv,
     shortest_arc,
 )
-from poise.motion.smoothing import find_runs
+from poise.motion.smoothing import find_runs, smoothstep
 
 #: The share of a limb's length over which it slows down before it is straight.
 SOFT = 0.02
@@ -37,53 +36,12 @@ BACKWARDS = 0.25
 _LIMBS = {"foot": ("thigh", "shin"), "hand": ("upper_arm", "forearm")}
 
 
-class TwoBone(NamedTuple):
-    """mid, end: `(..., 3)` m, world. normal: `(..., 3)`, the unit axis about which the limb bends."""
-
-    mid: Tensor
-    end: Tensor
-    normal: Tensor
-
-
 class Limb(NamedTuple):
     """The joints of one limb: where it starts (hip), bends (knee) and ends (ankle)."""
 
     root: int
     mid: int
     end: int
-
-
-def two_bone(
-    root: Tensor,
-    target: Tensor,
-    pole: Tensor,
-    l1: Tensor | float,
-    l2: Tensor | float,
-    soft: float = SOFT,
-) -> TwoBone:
-    """A limb of bones `l1`, `l2` (m) from `root` towards `target`, bent to the side of `pole`.
-
-    Args:
-        root, target: `(..., 3)` m. pole: `(..., 3)`, a direction; only its part across the line from
-            root to target counts (an axis across it is taken where nothing remains).
-        soft: see `soft_reach`. A target out of reach is approached along the line to it.
-
-    The law of cosines gives the place of the knee along that line:
-    a = (l1^2 - l2^2 + d^2) / (2 d), h = sqrt(l1^2 - a^2).
-    """
-    l1, l2 = (torch.as_tensor(x, dtype=root.dtype) for x in (l1, l2))
-    line = target - root
-    along = _direction(line)
-    d = soft_reach(line.norm(dim=-1), l1, l2, soft)
-    side = pole - (pole * along).sum(-1, keepdim=True) * along
-    lost = side.norm(dim=-1, keepdim=True) < 1e-9 * (1.0 + pole.norm(dim=-1, keepdim=True))
-    side = normalize(torch.where(lost, across(along), side))
-    a = (l1.square() - l2.square() + d.square()) / (2.0 * d.clamp_min(1e-9))
-    a = torch.minimum(torch.maximum(a, -l1), l1)
-    h = (l1.square() - a.square()).clamp_min(0.0).sqrt()
-    mid = root + a.unsqueeze(-1) * along + h.unsqueeze(-1) * side
-    # The end turns from the side towards the line: upper bone x lower bone points along side x along.
-    return TwoBone(mid, root + d.unsqueeze(-1) * along, torch.linalg.cross(side, along))
 
 
 def soft_reach(distance: Tensor, l1: Tensor, l2: Tensor, soft: float = SOFT) -> Tensor:
@@ -150,10 +108,9 @@ def match_positions(
         soft: see `soft_reach`; a limb that the motion itself holds straighter may stay so.
     """
     out = rot.clone()
-    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
     for joint, goal in targets.items():
         limb = (limbs or {}).get(joint) or limb_of(skeleton, joint)
-        pos, quat = forward_kinematics(skeleton.parents, offsets, root_pos, out)
+        pos, quat = skeleton.forward(root_pos, out)
         goal = torch.as_tensor(goal, dtype=rot.dtype)
         now = pos[:, limb.end]
         goal = torch.where(goal.isfinite().all(-1, keepdim=True), goal, now)
@@ -234,7 +191,7 @@ def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor
     size = own.norm(dim=-1, keepdim=True)
     # Full weight on the moment's own axis from 2 * STRAIGHT on.
     share = ((size - STRAIGHT) / STRAIGHT).clamp(0.0, 1.0)
-    share = share * share * (3 - 2 * share)
+    share = smoothstep(share)
     mixed = share * signed / size.clamp_min(1e-12) + (1 - share) * usual
     axis = normalize(torch.where(mixed.norm(dim=-1, keepdim=True) < 0.1, usual, mixed))
     return quat_rotate(upper_quat, axis), (own * axis).sum(-1)
@@ -273,9 +230,3 @@ def _turn(
     rot[:, limb.root] = quat_between(above(limb.root), quat_mul(swing, quat[:, limb.root]))
     rot[:, limb.mid] = quat_between(above(limb.mid), quat_mul(bend, quat[:, limb.mid]))
     rot[:, limb.end] = quat_between(quat_mul(both, above(limb.end)), quat[:, limb.end])
-
-
-def _direction(v: Tensor) -> Tensor:
-    """`v (..., 3)` at unit length; a zero vector points down."""
-    down = torch.tensor([0.0, 0.0, -1.0], dtype=v.dtype)
-    return torch.where(v.norm(dim=-1, keepdim=True) < 1e-12, down, normalize(v))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import NamedTuple
 
@@ -221,8 +220,6 @@ class CharacterGoals:
         get_up: how the policy's library gets up.
         place: `(2)` m, where it stands at first.
         executor: plans recovery motions beside the loop; None plans at once, as tests do.
-        move: is told coordinates of the person, and those at which and facing as which they are to be
-            from now on.
 
     Attributes:
         doing: `EASE`, `TRACKS`, `FALLS` or `RETURNS`.
@@ -231,6 +228,8 @@ class CharacterGoals:
         anew: whether the last frame begins a motion from where the body is, so that no frames before it
             count any more.
         still: whether the last two frames were the same.
+        moved: coordinates of the person in the last step, and those at which and facing as which they
+            are to be from now on; None where the person's motion goes on as it did.
     """
 
     def __init__(
@@ -238,9 +237,9 @@ class CharacterGoals:
         get_up: GetUpPlanner,
         place: tuple[float, float],
         executor: Executor | None = None,
-        move: Callable[[Tensor, Tensor], None] | None = None,
     ):
-        self.get_up, self._move = get_up, move
+        self.get_up = get_up
+        self.moved: tuple[Tensor, Tensor] | None = None
         self.ease = get_up.recovery_clips.ease.clone()
         self.ease[:2] = torch.tensor(place, dtype=torch.float64)
         self._phases = RecoveryPhases(1, get_up.rate_hz, "cpu", hurries=True)
@@ -262,10 +261,6 @@ class CharacterGoals:
         """`EASE`, `TRACKS`, `FALLS` or `RETURNS`."""
         now = (TRACKS, FALLS, RETURNS)[int(self._phases.doing)]
         return EASE if self._eases and now == TRACKS else now
-
-    def on_move(self, move: Callable[[Tensor, Tensor], None]) -> None:
-        """Says what moves the person's motion, see `move`."""
-        self._move = move
 
     def begin(self, frame: Tensor) -> None:
         """The character was set down on a frame."""
@@ -297,7 +292,7 @@ class CharacterGoals:
             person: the person's motion now, None without one.
             stalled: nothing new has come of the person; its pose rests meanwhile.
         """
-        before, self.anew = self.last, False
+        before, self.anew, self.moved = self.last, False, None
         self.last = self._next(person, body, stalled)
         self._drift = torch.zeros_like(self._drift) if self.anew else self.last[:2] - before[:2]
         self.still = bool((self.last - before).abs().max() < 1e-9)
@@ -417,8 +412,7 @@ class CharacterGoals:
 
     def _put(self, person: Tensor, there: Tensor) -> None:
         """Lets the person's motion go on from elsewhere."""
-        if self._move is not None:
-            self._move(person, there)
+        self.moved = person.clone(), there.clone()
         turns = heading_angle(there[3:7]) - heading_angle(person[3:7])
         self._person = there if abs(turns) < 1e-6 else None
 

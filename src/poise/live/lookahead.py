@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,31 +30,6 @@ from poise.plan.lookahead import PAST, Choice
 
 #: Simulated at once where a character looks ahead in real time: candidates, horizon, hold.
 QUICK = LookaheadConfig(candidates=8, horizon=6, hold_steps=3, smoothing=(0.0, 0.7), corrections=(1.0,))
-
-
-class Ahead(Protocol):
-    """What acts in place of the policy in the worlds that look ahead."""
-
-    def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
-        """Acts in `env` from now on, and looks ahead in some of its worlds."""
-        ...
-
-    def act(self, obs: Tensor) -> Tensor:
-        """Actions `(N, A)`."""
-        ...
-
-    def skip(self) -> None:
-        """The policy acts alone in this step: what was decided before is of another time afterwards."""
-        ...
-
-    @property
-    def acts(self) -> bool:
-        """Whether the last actions had looked ahead."""
-        ...
-
-    def close(self) -> None:
-        """Frees what it holds."""
-        ...
 
 
 def tries_of(tracker: Tracker, config: LookaheadConfig, seed: int) -> Lookahead:
@@ -78,28 +53,32 @@ def tries_of(tracker: Tracker, config: LookaheadConfig, seed: int) -> Lookahead:
 
 
 class AheadAtOnce:
-    """Looks ahead while the loop waits, as tests do."""
+    """Looks ahead while the loop waits, as tests do.
+
+    Attributes:
+        acts: whether the last actions had looked ahead.
+    """
 
     def __init__(self, tracker: Tracker, seed: int):
         self._lookahead = tries_of(tracker, QUICK, seed)
         self.acts = False
 
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
-        """See `Ahead`."""
+        """Acts in `env` from now on, and looks ahead in some of its worlds."""
         self._watched = env, worlds
         self._lookahead.watch(env, worlds)
 
     def act(self, obs: Tensor) -> Tensor:
-        """See `Ahead`."""
+        """Actions `(N, A)`."""
         self.acts = True
         return self._lookahead.act(obs)
 
     def skip(self) -> None:
-        """See `Ahead`."""
+        """The policy acts alone in this step: decisions of before are of another time afterwards."""
         self.watch(*self._watched)
 
     def close(self) -> None:
-        """See `Ahead`."""
+        """Frees the copies."""
         self._lookahead.copies.close()
 
 
@@ -128,12 +107,8 @@ class _Asked(NamedTuple):
     meanwhile: np.ndarray
 
 
-class _Answer(NamedTuple):
-    """What the other process decided; see `Choice`."""
-
-    offsets: np.ndarray
-    smoothing: float
-    correction: float
+#: Fields of a `Choice`, offsets as an array.
+_Answer = tuple[np.ndarray, float, float]
 
 
 @dataclass(eq=False)
@@ -178,11 +153,11 @@ class AheadBeside:
         self._thread.start()
 
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
-        """See `Ahead`. What was asked before is not waited for."""
+        """See `AheadAtOnce`. A question of before is not waited for."""
         self._env, self._worlds = env, {k: _LookingCharacter() for k in worlds}
 
     def act(self, obs: Tensor) -> Tensor:
-        """See `Ahead`."""
+        """See `AheadAtOnce`."""
         env = self._env
         if env is None:
             raise PoiseError(
@@ -191,10 +166,10 @@ class AheadBeside:
                 code="environment-missing",
             )
         while not self._told.empty():
-            world, told = self._told.get()
+            world, (offsets, *rest) = self._told.get()
             self._waiting = False
             self.decided += 1
-            world.choice = Choice(torch.from_numpy(told.offsets), told.smoothing, told.correction)
+            world.choice = Choice(torch.from_numpy(offsets), *rest)
             world.step, world.since = world.since or 0, None
         pos, fresh = env.here().pos, (env.age == 0).tolist()
         n = len(obs)
@@ -217,7 +192,7 @@ class AheadBeside:
         return env.unfiltered(torch.lerp(much * self._policy.act(obs) + offsets, env.action, keep))
 
     def skip(self) -> None:
-        """See `Ahead`. What was asked is not waited for."""
+        """See `AheadAtOnce`. A question of before is not waited for."""
         self._worlds = {k: _LookingCharacter() for k in self._worlds}
 
     def _ask(self, i: int, world: _LookingCharacter, pos: Tensor) -> None:
@@ -254,7 +229,7 @@ class AheadBeside:
             return
 
     def close(self) -> None:
-        """See `Ahead`."""
+        """See `AheadAtOnce`."""
         self._asks.put(None)
         self._line.close()
         self._process.terminate()
@@ -281,7 +256,7 @@ def _decide_all(line: Connection, tracker: Tracker, seed: int) -> None:
         snapshot = Snapshot(_tensors(asked.worlds), asked.physics, _tensors(asked.goal), None)
         last, meanwhile, past = (torch.from_numpy(x) for x in (asked.last, asked.meanwhile, asked.past))
         made = lookahead.decide(snapshot, past, asked.off_m, last, meanwhile)
-        line.send(_Answer(made.offsets.numpy(), made.smoothing, made.correction))
+        line.send((made.offsets.numpy(), made.smoothing, made.correction))
 
 
 def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:

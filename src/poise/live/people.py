@@ -8,18 +8,19 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
 from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.kinematics import RetargetConfig, place_on_body
-from poise.kinematics.coords import wrapped
+from poise.kinematics.coords import Hinges, wrapped
+from poise.kinematics.retarget.passage import Retargeter, doublings, world_of
 from poise.kinematics.stream_noise import FadingFilter
-from poise.live import quats as q
-from poise.live.passage import FramePassage, Hinges, doublings, world_of
 from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, StreamPose, StreamTremble, leapt
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 
 #: s that are stood, m that the root may move meanwhile, and frames a second of what is measured.
 STAND_S, STILL_M, RATE = 2.0, 0.25, 30.0
@@ -63,7 +64,7 @@ class Offset:
 class Calibration:
     """Poses of one skeleton as coordinates of a body.
 
-    `move` lets the motion go on from elsewhere; at first it is where the source has it.
+    `where` lets the motion go on from elsewhere; at first it is where the source has it.
 
     Attributes:
         where: it is, against where the source has it.
@@ -72,7 +73,7 @@ class Calibration:
         scale: of the person's path.
     """
 
-    passage: FramePassage
+    passage: Retargeter
     hinges: Hinges
     feet: dict[int, np.ndarray]
     first: np.ndarray
@@ -84,7 +85,7 @@ class Calibration:
     @property
     def scale(self) -> float:
         """Size of the path on the body by that of the person."""
-        return self.passage.factor
+        return self.passage.scale.factor
 
     @classmethod
     def by(
@@ -104,7 +105,7 @@ class Calibration:
             PoiseError: a skeleton that is no human's.
         """
         on = place_on_body(clip, humanoid.table, example, RATE, how=how, near=humanoid)
-        passage = FramePassage(clip, example, None if how is None else how.scale)
+        passage = Retargeter.between(clip, example, factor=None if how is None else how.scale)
         feet = {j: turn.numpy() for j, turn in on.level.turns.items()}
         hinges = Hinges(example.skeleton, humanoid.table)
         out = cls(passage, hinges, feet, ease[7:])
@@ -120,7 +121,7 @@ class Calibration:
 
     def __call__(self, root_pos: np.ndarray, rot: np.ndarray) -> np.ndarray:
         """Coordinates `(7 + n)` of a pose, on the floor."""
-        root, world = self.passage(root_pos, rot)
+        root, world = self.passage(root_pos, world_of(self.passage.source, rot))
         for joint, turn in self.feet.items():
             world[joint] = q.mul(world[joint], turn)
         last = self.first if self._last is None else self._last
@@ -129,10 +130,6 @@ class Calibration:
         qpos[7:] += self.planted
         qpos[2] += self.floor
         return self.where(qpos)
-
-    def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """See `Offset.move`."""
-        self.where.move(seen, to)
 
 
 class StandingMeasure:
@@ -269,14 +266,31 @@ class Steady:
     def _places(self, channels: np.ndarray) -> np.ndarray:
         """`(T, J, 3)` m of channels `(T, C)`."""
         skeleton = self.skeleton
-        rot = channels[:, :-3].reshape(len(channels), -1, 4).swapaxes(0, 1)
-        world = world_of(skeleton, rot)
+        world = world_of(skeleton, channels[:, :-3].reshape(len(channels), -1, 4))
         above = np.maximum(skeleton.parents, 0)
-        out = q.rotate(world[above], np.asarray(skeleton.offsets)[:, None])
-        out[0] = channels[:, -3:]
+        out = q.rotate(world[:, above], np.asarray(skeleton.offsets))
+        out[:, 0] = channels[:, -3:]
         for joints, parents in doublings(tuple(skeleton.parents)):
-            out[joints] = out[parents] + out[joints]
-        return out.swapaxes(0, 1)
+            out[:, joints] = out[:, parents] + out[:, joints]
+        return out
+
+
+class Own(NamedTuple):
+    """A person's pose at the moment of a character's goal, on the person's own model.
+
+    Attributes:
+        skeleton: the model.
+        root_pos: `(3)` m.
+        rot: `(J, 4)` wxyz, local.
+        where: turns and moves the person's world to where the character is.
+        factor: size of the character's path by that of the person.
+    """
+
+    skeleton: Skeleton
+    root_pos: np.ndarray
+    rot: np.ndarray
+    where: Offset
+    factor: float
 
 
 #: s without a packet after which a person is away, and after which it is forgotten.

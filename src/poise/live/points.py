@@ -204,9 +204,9 @@ class PointFit:
 
     def _forget(self, now_s: float) -> None:
         """Forgets people that have been away for long."""
-        for name in [n for n, p in self._people.items() if now_s - p.arrived_s > FORGET_S]:
-            del self._people[name]
-            self.inbox.standing.pop(name, None)
+        for gone in [n for n, p in self._people.items() if now_s - p.arrived_s > FORGET_S]:
+            del self._people[gone]
+            self.inbox.standing.pop(gone, None)
 
     def _run(self) -> None:
         while (frame := self._waiting.get()) is not None:

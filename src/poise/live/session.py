@@ -2,7 +2,7 @@
 
 The loop: 30 times a second what came becomes goals, goals become actions, actions become motion. It
 never waits. Sources put packets into an `Inbox`, pages put commands into a bounded queue, and a step
-is handed to the page and the recorder, each of which takes the newest when it can.
+is handed to the page and the sinks, each of which takes the newest when it can.
 """
 
 from __future__ import annotations
@@ -14,25 +14,26 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
-from poise.live.aims import Targets
-from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
-from poise.live.commands import LiveConfig
-from poise.live.page.server import PageServer, as_json, packed
+from poise.live.page.server import PageServer
 from poise.live.people import STAND, Steady
 from poise.live.points import PointFit
-from poise.live.record import CharacterRecorder
+from poise.live.protocol import DOING, LiveConfig, as_json, packed
+from poise.live.sinks import CharacterRecorder, OwnPuppet, VmcSink
 from poise.live.sockets import Guard, StreamDoor
 from poise.live.sources import FileSource
 from poise.live.stream import Inbox, StreamTremble
-from poise.live.vmc import NEEDED, PARENTS, OwnPuppet, VmcSink, VmcSource
+from poise.live.targets import Targets
+from poise.live.vmc import VmcSource
 from poise.live.world import LiveStep, LiveWorld
 from poise.motion import Clip
 from poise.synthesis.generator import Kinematic
@@ -47,9 +48,8 @@ class CommandQueue:
     """Commands that wait, and what they change.
 
     Attributes:
-        waiting: commands that were checked, see `poise.live.commands`.
+        waiting: commands that were checked, see `poise.live.protocol`.
         paused: whether physics waits.
-        recording: is told to begin or end a recording; None: there is none.
         pulled: when each character was last pulled at, by the loop's clock.
     """
 
@@ -57,7 +57,6 @@ class CommandQueue:
         self.aims, self.world = aims, aims.world
         self.waiting: deque[dict[str, Any]] = deque(maxlen=MOST_ORDERS)
         self.paused = False
-        self.recording: Callable[[bool], None] | None = None
         self.pulled: dict[int, float] = {}
 
     def obey(self, now_s: float) -> None:
@@ -92,8 +91,6 @@ class CommandQueue:
             self.paused = command["on"]
         elif kind == "follow":
             self.aims.people.switch(k, command["person"])
-        elif kind == "record" and self.recording is not None:
-            self.recording(command["on"])
         elif kind == "set":
             self._set(command)
 
@@ -228,20 +225,15 @@ def _percentiles(seconds: deque[float]) -> list[float]:
     return [round(float(np.percentile(kept, p)), 1) for p in (50, 99)]
 
 
-#: What characters do, in the order of the numbers in frames.
-DOING = (EASE, TRACKS, FALLS, RETURNS)
-
-
-def hello_of(world: LiveWorld, names: dict[str, Any]) -> dict[str, Any]:
+def hello_of(table: BodyTable, count: int, rate_hz: float, more: Mapping[str, Any]) -> dict[str, Any]:
     """What a page needs to draw the characters.
 
-    names: more of it, such as whether there is a recorder.
+    more: of it, such as whether there is a recorder.
     """
-    table = world.humanoid.table
     return {
-        "characters": world.count,
-        "rate": world.rate_hz,
-        "bodies": list(world.humanoid.bodies),
+        "characters": count,
+        "rate": rate_hz,
+        "bodies": [r.name for r in table.rows],
         "parents": [r.parent for r in table.rows],
         "shapes": [
             {"body": i, "kind": g.kind, "size": list(g.size), "pos": list(g.pos), "quat": list(g.quat)}
@@ -250,62 +242,14 @@ def hello_of(world: LiveWorld, names: dict[str, Any]) -> dict[str, Any]:
         ],
         "ball": 0.12,
         "doing": list(DOING),
-        "looks_ahead": world.can_look_ahead,
-        **names,
+        **more,
     }
 
 
-class ShowPage:
-    """Hands steps to a page server."""
-
-    def __init__(self, server: PageServer):
-        self.server = server
-
-    def show(self, seen: LiveStep, live: Live) -> None:
-        """Takes a control step."""
-        doing = [c.doing for c in live.world.characters]
-        frame = packed(
-            live.steps, seen.time_s, [DOING.index(d) for d in doing], seen.bodies, seen.goals, seen.ball
-        )
-        self.server.publish(frame, lambda: as_json(seen.time_s, doing, seen.bodies))
-
-
-class ShowRecorder:
-    """Hands steps to a recording while it is on."""
-
-    def __init__(self, recorder: CharacterRecorder):
-        self.recorder = recorder
-
-    def show(self, seen: LiveStep, live: Live) -> None:
-        """Takes a control step."""
-        self.recorder.write(seen.qpos)
-
-
-class ShowVmc:
-    """Hands steps to a VMC sink."""
-
-    def __init__(self, sink: VmcSink):
-        self.sink = sink
-
-    def show(self, seen: LiveStep, live: Live) -> None:
-        """Takes a control step."""
-        own = live.aims.own(self.sink.character)
-        if own is not None and not set(NEEDED) <= set(own.skeleton.names) <= set(PARENTS):
-            # A person that is no VRM model.
-            own = None
-        self.sink.write(seen.bodies, seen.time_s, seen.goals, own)
-
-
+#: What a step goes to; it returns at once.
+Shows = Callable[[LiveStep], None]
 #: s for which no character looks ahead after a step that came too late.
 HURRIES_S = 2.0
-
-
-class Shows(Protocol):
-    """What a step's outcome goes to; it returns at once."""
-
-    def show(self, seen: LiveStep, live: Live) -> None:
-        """Takes a control step."""
-        ...
 
 
 class Live:
@@ -313,7 +257,6 @@ class Live:
 
     Args:
         inbox: where sources put packets.
-        shows: what steps go to.
         executor: calibrates and plans beside the loop, and characters look ahead in a process of its
             own; None does it at once, as tests do.
         clock: s; the clock by which packets arrive.
@@ -330,13 +273,12 @@ class Live:
         tracker: Tracker,
         config: LiveConfig | None = None,
         inbox: Inbox | None = None,
-        shows: Sequence[Shows] = (),
         executor: Executor | None = None,
         clock: Callable[[], float] = time.perf_counter,
         generator: Kinematic | None = None,
     ):
         self.config = c = config or LiveConfig()
-        self.tracker, self.inbox, self.shows = tracker, inbox or Inbox(Steady), list(shows)
+        self.tracker, self.inbox = tracker, inbox or Inbox(Steady)
         ahead, beside = tuple(range(c.lookahead)), executor is not None
         self.world = LiveWorld(tracker, c.characters, executor, ahead, c.seed, beside)
         self.aims = Targets(self.world, c, executor, generator)
@@ -356,8 +298,8 @@ class Live:
         """Whether physics waits."""
         return self.orders.paused
 
-    def run(self, until: Callable[[], bool]) -> None:
-        """Steps in real time until `until()`; a step that comes late is not made up for."""
+    def run(self, until: Callable[[], bool], shows: Sequence[Shows] = ()) -> None:
+        """Steps in real time until `until()`, handing each to `shows`; late ones are not made up for."""
         period = 1.0 / self.rate_hz
         due = self.clock()
         while not until():
@@ -371,11 +313,11 @@ class Live:
                 # Better in time than far-sighted.
                 self._hurry = self.steps + round(HURRIES_S * self.rate_hz)
             due += period
-            self.step(now)
+            self.step(now, shows)
             due += self._phase.shift(due)
 
-    def step(self, now_s: float) -> LiveStep | None:
-        """One control step at `now_s`; None while paused."""
+    def step(self, now_s: float, shows: Sequence[Shows] = ()) -> LiveStep | None:
+        """One control step at `now_s`, which goes to `shows`; None while paused."""
         began = self.clock()
         packets = self.inbox.take()
         self.people.add(packets)
@@ -387,8 +329,8 @@ class Live:
         self.times.steps += 1
         if self.steps % 30 == 0:
             self.people.tidy(now_s)
-        for show in self.shows:
-            show.show(seen, self)
+        for show in shows:
+            show(seen)
         arrived = [t for line in packets.values() for t, _ in line[-1:]]
         self._phase.add(arrived)
         self.times.add(began, self.clock(), arrived)
@@ -454,26 +396,26 @@ class Session:
         )
         self.recorded: list[Path] = []
         self.last: dict[str, Any] = {}
-        self.live.orders.recording = self._record
-        hello = hello_of(world, {"records": True, "dreams": made is not None})
+        more = {"looks_ahead": world.can_look_ahead, "records": True, "dreams": made is not None}
+        hello = hello_of(world.humanoid.table, world.count, world.rate_hz, more)
         places = tracker.config.goal == "keypoints"
         self.points = PointFit(self.inbox, tracker.example, world.humanoid.table, places)
         guard = Guard(wanted.host, wanted.port, wanted.token)
         self.server = PageServer(
-            guard, hello, self.inbox, self.live.commands.append, self.figures, clock, self.points
+            guard, hello, self.inbox, self._command, self.figures, clock, self.points.offer
         )
-        self.live.shows += [ShowPage(self.server), ShowRecorder(self.recorder)]
+        self.shows: list[Shows] = [self._show, self.recorder.show]
         self.files = FileSource(dict(wanted.clips), self.inbox, clock)
         self.vmc = None if wanted.vmc is None else VmcSource(wanted.host, wanted.vmc, self.inbox, clock)
         self.door = None
         if wanted.keypoints is not None:
             self.door = StreamDoor(
-                wanted.host, wanted.keypoints, self.inbox, self.points, clock, wanted.token
+                wanted.host, wanted.keypoints, self.inbox, self.points.offer, clock, wanted.token
             )
         self.sink = None
         if wanted.vmc_out is not None:
             self.sink = VmcSink(wanted.vmc_out, OwnPuppet(world.humanoid.table, tracker.example))
-            self.live.shows.append(ShowVmc(self.sink))
+            self.shows.append(self.sink.show)
         self.files.start()
         self.points.start()
         if self.door is not None:
@@ -502,7 +444,8 @@ class Session:
                     until_s is not None
                     and time.perf_counter() >= until_s
                     and (live.steps >= FEWEST or live.paused)
-                )
+                ),
+                self.shows,
             )
         finally:
             sys.setswitchinterval(usual)
@@ -525,8 +468,18 @@ class Session:
         self.live.close()
         return self.recorded
 
-    def _record(self, on: bool) -> None:
-        if on:
+    def _show(self, step: LiveStep) -> None:
+        text = partial(as_json, step.time_s, step.doing, step.bodies)
+        doing = [DOING.index(d) for d in step.doing]
+        self.server.publish(
+            packed(step.step, step.time_s, doing, step.bodies, step.goals, step.ball), text
+        )
+
+    def _command(self, command: dict[str, Any]) -> None:
+        """Takes a checked command of a page: all but those to record are the loop's."""
+        if command["type"] != "record":
+            self.live.commands.append(command)
+        elif command["on"]:
             self.recorder.start()
         else:
             # Files are written beside the loop.

@@ -18,8 +18,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from poise.errors import PoiseError
-from poise.live.commands import MOST_BYTES, VERSION
-from poise.live.sources import Fits, JsonStream
+from poise.live.protocol import MOST_BYTES, VERSION
+from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
 
 #: Names of this machine.
@@ -272,7 +272,7 @@ class StreamDoor:
     """
 
     def __init__(
-        self, host: str, port: int, inbox: Inbox, points: Fits, clock: Callable[[], float],
+        self, host: str, port: int, inbox: Inbox, points: Takes, clock: Callable[[], float],
         token: str | None = None,
     ):  # fmt: skip
         self.inbox, self.points, self.clock, self._token = inbox, points, clock, token

@@ -1,17 +1,16 @@
-"""Sources of motion: a file played as a stream, and JSON messages of one connection."""
+"""Sources of motion: files played as streams, and JSON messages of one connection."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live import quats as q
-from poise.live.commands import (
+from poise.live.protocol import (
     JOINTS,
     name,
     number,
@@ -24,7 +23,10 @@ from poise.live.commands import (
 )
 from poise.live.stream import PEOPLE, Inbox, Packet
 from poise.motion import Clip, Skeleton
+from poise.motion import quats as q
 
+#: Takes a frame of keypoints; returns at once.
+Takes = Callable[["KeypointFrame"], None]
 #: s in which the end of a clip passes into its beginning.
 FADE_S = 0.4
 #: Share of a clip at either end in which it may pass over, and frames a second that are looked at.
@@ -152,24 +154,16 @@ class KeypointFrame(NamedTuple):
     arrived_s: float
 
 
-class Fits(Protocol):
-    """What frames go to."""
-
-    def offer(self, frame: KeypointFrame) -> None:
-        """Takes a frame; returns at once."""
-        ...
-
-
 class JsonStream:
     """What one connection sends, see docs/live.md.
 
     Args:
         inbox: where packets go; what is refused is counted there.
         own: what is put before the names of people, so that connections keep apart.
-        points: fits keypoints; None takes none.
+        points: takes keypoints; None takes none.
     """
 
-    def __init__(self, inbox: Inbox, own: str = "", points: Fits | None = None):
+    def __init__(self, inbox: Inbox, own: str = "", points: Takes | None = None):
         self.inbox, self._own, self._points = inbox, own, points
         self._labels = dict[str, tuple[str, ...]]()
         self._skeletons: dict[str, tuple[Skeleton, str]] = {}
@@ -224,4 +218,4 @@ class JsonStream:
             return
         points = points_of(message, len(labels))
         time_s = number(message["time"]) if "time" in message else arrived_s
-        self._points.offer(KeypointFrame((self._own + person)[:64], labels, points, time_s, arrived_s))
+        self._points(KeypointFrame((self._own + person)[:64], labels, points, time_s, arrived_s))

@@ -4,7 +4,8 @@ can be thrown at them. Compliance feels the hand that drags a body, and blows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import NamedTuple
@@ -24,7 +25,8 @@ from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.live.characters import FALLS, CharacterGoals, CharacterState
-from poise.live.lookahead import Ahead, AheadAtOnce, AheadBeside
+from poise.live.lookahead import AheadAtOnce, AheadBeside
+from poise.live.people import Own
 from poise.sim import Backend, CharacterRows, Drive, Scene, SceneSim, alone
 from poise.sim import Character as Actor
 from poise.sim.props import Ball
@@ -99,23 +101,32 @@ BALL_MPS = 4.0
 
 
 class LiveStep(NamedTuple):
-    """What a control step came to, for those that show it.
+    """A control step, for the page and the sinks.
 
     Attributes:
-        time_s: simulated time.
+        step: its number. time_s: simulated time.
+        doing: what each character does.
         bodies: `(K, B, 7)` m and wxyz of each character.
         goals: `(K, B, 7)` of what each was to do.
         ball: `(7)`.
         qpos: `(K, 7 + n)`.
-        off_m: `(K)` m, between the two on average.
+        off_m: `(K)` m, between body and goal on average.
+        own: of each the person's pose that its goal is now; None where it follows something else.
     """
 
+    step: int
     time_s: float
+    doing: tuple[str, ...]
     bodies: np.ndarray
     goals: np.ndarray
     ball: np.ndarray
     qpos: np.ndarray
     off_m: np.ndarray
+    own: tuple[Own | None, ...]
+
+
+#: Steps of which it is kept what was read; goals are fewer behind.
+READ = 16
 
 
 class LiveWorld:
@@ -183,10 +194,11 @@ class LiveWorld:
         self.substeps, self.resets, self.steps, self.unwound = sim.substeps, 0, 0, 0
         self._range = torch.from_numpy(body.model.jnt_range[1:].T.copy()).to(self.rows.state.qpos)
         self.lead, self._full = [1] * count, 1
+        self._read = [deque[Own | None](maxlen=READ) for _ in range(count)]
         self.hurries, self.looked = False, 0
         self._act = tracker.policy.act
-        self._ahead: Ahead | None = None
-        self._look: Callable[[], Ahead] = lambda: (AheadBeside if beside else AheadAtOnce)(tracker, seed)
+        self._ahead: AheadAtOnce | AheadBeside | None = None
+        self._beside, self._seed = beside, seed
         if lookahead and tracker.value is None:
             raise PoiseError(
                 "the policy was saved without its critic, which lookahead needs", code="critic-missing"
@@ -198,7 +210,7 @@ class LiveWorld:
         """Which characters look ahead; the others act at once."""
         self.ahead_of = tuple(k for k in characters if 0 <= k < self.count)
         if self._ahead is None and self.ahead_of and self.can_look_ahead:
-            self._ahead = self._look()
+            self._ahead = (AheadBeside if self._beside else AheadAtOnce)(self.tracker, self._seed)
         if self._ahead is not None:
             self._ahead.watch(self.env, self.ahead_of)
 
@@ -269,14 +281,18 @@ class LiveWorld:
             elif character.still:
                 self.lead[k] = min(self._full, self.lead[k] + 1)
 
-    def step(self, frames: Tensor, places: Tensor | None = None) -> LiveStep:
+    def step(
+        self, frames: Tensor, places: Tensor | None = None, own: Sequence[Own | None] = ()
+    ) -> LiveStep:
         """One control step toward the frames `(K, 7 + n)`, the newest that the goals know.
 
-        places: see `StreamGoal.push`.
+        places: see `StreamGoal.push`. own: the people's poses that the frames are.
         """
         env, goal = self.env, self.goal
         self._lead_on()
         goal.push(frames, places=places)
+        for read, pose in zip(self._read, own or [None] * self.count, strict=True):
+            read.append(pose)
         lead = torch.tensor(self.lead)
         goal.at.copy_((goal.count - 1 - lead).clamp_min(0))
         goal.aim(None, None)
@@ -325,7 +341,11 @@ class LiveWorld:
         bodies, goals = (torch.cat((p.pos, p.quat), -1).float().numpy().copy() for p in (pose, goal))
         ball = state.qpos[0, at].float().numpy().copy()
         qpos = self.rows.state.qpos.double().numpy().copy()
-        return LiveStep(self.steps / self.rate_hz, bodies, goals, ball, qpos, self._off)
+        read = zip(self._read, self.lead, strict=True)
+        own = tuple(poses[-back] if len(poses) >= back else None for poses, back in read)
+        doing = tuple(c.doing for c in self.characters)
+        at_s, off = self.steps / self.rate_hz, self._off
+        return LiveStep(self.steps, at_s, doing, bodies, goals, ball, qpos, off, own)
 
     def close(self) -> None:
         """Frees the simulations."""

@@ -1,6 +1,6 @@
 """Pure functions that score motion: tracking, plausibility, help; definitions in docs/results.md."""
 
-from poise.metrics.inbetween import l2p, l2q, npss, physics
+from poise.metrics.gap_errors import l2p, l2q, npss, physics
 from poise.metrics.plausibility import (
     Deviation,
     HelpAudit,
@@ -14,15 +14,18 @@ from poise.metrics.plausibility import (
     help_audit,
     jerk,
     penetration,
-    physdiff_float,
-    physdiff_penetrate,
     s2h_foot_penetration,
     smoothness,
-    uhc_penetration,
-    uhc_skate,
 )
-from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
-from poise.metrics.tracking import (
+from poise.metrics.shape_points import (
+    KINDS,
+    Shapes,
+    centre_of_mass,
+    foot_points,
+    geom_heights,
+    lowest_points,
+)
+from poise.metrics.tracking_errors import (
     LASTING_S,
     LOST,
     RULES,
@@ -79,15 +82,11 @@ __all__ = [
     "npss",
     "off_feet",
     "penetration",
-    "physdiff_float",
-    "physdiff_penetrate",
     "physics",
     "s2h_foot_penetration",
     "smoothness",
     "span_mask",
     "success",
     "success_rule",
-    "uhc_penetration",
-    "uhc_skate",
     "velocity_error",
 ]

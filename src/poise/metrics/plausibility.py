@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.metrics.tracking import MM, PHC_FPS, masked_mean, masked_quantile, span_mask
+from poise.metrics.tracking_errors import MM, PHC_FPS, masked_mean, masked_quantile, span_mask
 from poise.motion.rotations import GRAVITY
 
 CONTACT_HEIGHT = 0.02
@@ -19,8 +19,6 @@ CONTACT_RISE = 0.2
 """m/s; a foot point that rises or falls faster is landing or leaving, not in contact."""
 SWING_SPEED = 1.0
 """m/s; a foot point that is faster while another one is planted belongs to a swinging foot."""
-PHYSDIFF_M = 0.005
-"""m; PhysDiff's tolerance of a lowest point that touches."""
 BALLISTIC_TOLERANCE = 0.4
 """Share of g by which the vertical acceleration may differ from -g in flight."""
 BALLISTIC_WINDOW = 0.1
@@ -90,34 +88,6 @@ def foot_slide(
     """
     speed, contact = foot_contacts(foot_points, fps, height=height, ground=ground, mask=mask)
     return masked_mean(speed, contact, (-2, -1))
-
-
-def uhc_skate(foot_points: Tensor) -> Tensor:
-    """UHC's skate, mm per frame: per-frame mean XY displacement of points at z <= 0 in both frames.
-
-    A frame without such points counts zero; the mean runs over the T - 1 steps. No rate is applied
-    (UHC's data are at 30 Hz).
-    """
-    low = foot_points[..., 2] <= 0.0
-    contact = low[..., 1:, :] & low[..., :-1, :]
-    moved = torch.diff(foot_points[..., :2], dim=-3).norm(dim=-1) * MM
-    return torch.nan_to_num(masked_mean(moved, contact, -1), nan=0.0).mean(-1)
-
-
-def uhc_penetration(points: Tensor) -> Tensor:
-    """UHC's penetration, mm: mean depth of the points with z < 0 (zero without any), mean of frames."""
-    depth = -points[..., 2] * MM
-    return torch.nan_to_num(masked_mean(depth, depth > 0, -1), nan=0.0).mean(-1)
-
-
-def physdiff_penetrate(lowest: Tensor) -> Tensor:
-    """PhysDiff's penetrate, mm: depth of the lowest point, zero within 5 mm, mean of frames."""
-    return torch.where(lowest < -PHYSDIFF_M, -lowest, torch.zeros_like(lowest)).mean(-1) * MM
-
-
-def physdiff_float(lowest: Tensor) -> Tensor:
-    """PhysDiff's float, mm: height of the lowest point, zero within 5 mm; flight counts too."""
-    return torch.where(lowest > PHYSDIFF_M, lowest, torch.zeros_like(lowest)).mean(-1) * MM
 
 
 def s2h_foot_penetration(height: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,11 +6,14 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
+
+from poise.errors import PoiseError
 
 #: Edges of the bands, as shares of half the frame rate, in which a floor is looked for; a band belongs
 #: to it while all groups together have less than `FLAT` times the power of the highest three.
@@ -31,6 +34,8 @@ HIGHEST_HZ = 15.0
 #: fast, at 30 frames/s. Less than this share of the way from frame to frame (rms) is none either: flips
 #: and sprints have it. Where the highest bands begin below this frequency (Hz) they hold motion.
 WHITE_MM, WHITE_SHARE, WHITE_HZ = 5.0, 0.08, 6.0
+#: White noise (mm) that leaves nothing of a motion.
+NOTHING_MM = 300.0
 #: Frames that a clip must have for its noise to be told.
 SHORTEST = 12
 #: So many trembles are looked for, one after another.
@@ -163,6 +168,17 @@ def _largest(values: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndar
     return out
 
 
+def only_noise(source: str, here: slice, size: str) -> PoiseError:
+    """The error of frames that jump about by that `size` each, so that nothing is left to be told."""
+    return PoiseError(
+        f"frames {here.start} to {here.stop - 1} jump about by {size} each: there is no motion to be "
+        "told",
+        source,
+        "Cut them off; --raw takes the file as it is",
+        code="only-noise",
+    )
+
+
 def white_mm(positions: np.ndarray, fps: float) -> float:
     """White noise (mm, rms over joints) of `positions (T, J, 3)` m: the floor of the spectrum or that of
     the median frame, whichever is less, since a burst of motion is no noise."""
@@ -262,7 +278,11 @@ def tremble_of(
 
 
 def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> np.ndarray:
-    """n of the module's text, for white noise of size 1 and a tremble of variance `size`."""
+    """The tremble n, for white noise s of size 1 and a tremble of variance `size`:
+
+    min over x, n   sum |y - x - n|^2 / s^2 + lambda |x'''|^2
+                        + |n_t+1 - 2 r cos(w) n_t + r^2 n_t-1|^2 / q.
+    """
     frames = len(y)
     wander = np.exp(-np.pi * WANDER_HZ / fps)
     step = np.array([wander**2, -2 * wander * np.cos(2 * np.pi * hz / fps), 1.0])
@@ -305,7 +325,13 @@ def spline(frames: int, stiff: float) -> np.ndarray:
 
 
 def smoothed(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """The channels without white noise of variance `floor (G)`, the sum over a group's channels."""
+    """The channels without white noise of variance `floor (G)`, the sum over a group's channels.
+
+    Each is the mean of smoothing splines of many stiffnesses lambda, weighted in every frame by how near
+    to the truth Stein's unbiased estimate says they are, around the frame and over the clip:
+
+        risk = |y - S y|^2 / s^2 + 2 tr(S) / T.
+    """
     from scipy.linalg import cho_solve_banded
     from scipy.ndimage import gaussian_filter1d
 
@@ -332,6 +358,14 @@ def smoothed(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -
         share = gaussian_filter1d(share / share.sum(0), CHANGE_S * fps, axis=1, mode="nearest")
         out[:, mine] = (share[..., None] * stack).sum(0)
     return out
+
+
+Values = TypeVar("Values", np.ndarray, Tensor)
+
+
+def smoothstep(u: Values) -> Values:
+    """From 0 to 1 as `u` does, level at both ends."""
+    return u * u * (3.0 - 2.0 * u)
 
 
 def find_runs(bad: np.ndarray, gap: int) -> list[tuple[int, int]]:

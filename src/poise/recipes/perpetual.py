@@ -25,9 +25,9 @@ from poise.kinematics.forward import shapes_of
 from poise.metrics import foot_points
 from poise.motion import Clip, ClipLibrary
 from poise.motion.noise import VIDEO, perturb_clip, scaled
+from poise.recipes.body_shapes import motions_of, shaped
 from poise.recipes.imitation import Clips, Imitation, fitted
 from poise.recipes.perpetual_settings import Perpetual, Recovers
-from poise.recipes.shapes import motions_of, shaped
 
 
 def noisy(imitation: Imitation, strengths: Sequence[float], seed: int = 0) -> Imitation:

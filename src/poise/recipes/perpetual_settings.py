@@ -1,12 +1,14 @@
-"""The settings of a run of the perpetual controller, each ablation of the paper one switch of them."""
+"""The settings of a run of the perpetual controller: one network for a whole library.
+
+The switches of the paper's ablations, and training by stages, are `papers.perpetual.ablations`.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from poise.errors import PoiseError
 from poise.settings import (
@@ -19,6 +21,7 @@ from poise.settings import (
     Range,
     Share,
     from_data,
+    imported,
     part,
     validate,
 )
@@ -33,8 +36,8 @@ if TYPE_CHECKING:
         MiningConfig,
         PPOConfig,
     )
-    from poise.plan import TeacherConfig, TrajOptConfig
-    from poise.recipes.shapes import BodyShapes
+    from poise.plan import TeacherConfig
+    from poise.recipes.body_shapes import BodyShapes
     from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped, so that lying is told from leaning.
@@ -102,6 +105,7 @@ class Perpetual:
     """Settings of one run.
 
     Attributes:
+        ORDER: the place of the class that decides on the stages of a run.
         num_envs: environments that are simulated at once.
         seed: seed of everything random.
         goal: what is told of the next frame, "rotations" and places or "keypoints", which are places
@@ -133,22 +137,11 @@ class Perpetual:
         termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
             "code".
         first: share of the episodes that begin on frame 0, as evaluations do.
-        recovery: fallen and far characters get up and come back, by a primitive of its own and in the
-            composer's training; `recovering` says how. Without, it is not learned.
-        multiplicative: off, there is one network of a primitive's size and nothing that combines.
-        progressive: off, all primitives and the composer learn together from the start, on all clips.
-        single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
-            `ppo.policy_hidden` and a composer of `composer_hidden`.
-        max_primitives: no more than so many; fewer where nothing fails any more. That of recovery is one
-            more.
-        start: a primitive begins as a "copy" of the one before it, or "random".
-        lateral: whether it sees the hidden layers of the earlier ones.
-        combine, weights: see `nets.Composer`.
-        composer_clone: the composer first imitates for each clip the primitive that learned it.
-        expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits
-            the frames of the library where that is None, see `jobs.perpetual.cloning`.
-        trajopt: the expert follows trajectories that need no help, which are optimised first, see
-            `plan.trajopt`; None takes inverse dynamics, which need help.
+        recovery: fallen and far characters get up and come back; `recovering` says how. Without, it is
+            not learned.
+        single_hidden: widths of the network.
+        expert: training from nothing begins with a clone of a scripted expert, by `clone`, or by what
+            suits the frames of the library where that is None, see `jobs.perpetual.stages.clone_for`.
         help_start: N and N m, what the residual force may give at first; 0 does without. In each stage
             it has ended at the share `help_share` of the stage's time, or before by success.
         help_by: success is that of each "bin" of a clip, a second or so, which keeps or loses help of
@@ -158,8 +151,6 @@ class Perpetual:
         adaptive_over: such places of the "clip" that was drawn, or of the whole "library", so that more
             is seen of long and hard clips.
         residual_std: deviation of the noise on the residual action, in units of the limits.
-        shares: where in the training the first and the last primitive end at the latest; with recovery,
-            of what `recovering.share` leaves.
         evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of
             the control steps.
         starts: frames of each clip from which evaluations begin, evenly spread; a clip succeeds where it
@@ -172,9 +163,11 @@ class Perpetual:
         lessons: how is learned from it.
     """
 
+    ORDER: ClassVar[str] = "poise.jobs.perpetual.stages:StageOrder"
+
     goal: Literal["rotations", "keypoints"] = "rotations"
     shape: bool = False
-    shapes: BodyShapes = part("poise.recipes.shapes:BodyShapes")
+    shapes: BodyShapes = part("poise.recipes.body_shapes:BodyShapes")
     heading: Literal["hips", "twist"] = "hips"
     window: Annotated[tuple[int, ...], Range(2, unit="control steps")] = ()
     filter: Annotated[float, Range(0, 1, below=True)] = 0.0
@@ -194,26 +187,14 @@ class Perpetual:
     first: float = 0.1
     recovery: bool = True
     recovering: RecoveryPlan = field(default_factory=RecoveryPlan)
-    multiplicative: bool = True
-    progressive: bool = True
-    single: bool = False
-    max_primitives: Count = 3
-    start: Literal["copy", "random"] = "copy"
-    lateral: bool = False
-    combine: Literal["product", "means"] = "product"
-    weights: Literal["softmax", "softplus", "relu", "silu"] = "softmax"
     single_hidden: tuple[int, ...] = (1024, 512, 512)
-    composer_hidden: tuple[int, ...] = (256, 128)
-    composer_clone: bool = True
     expert: bool = True
-    trajopt: TrajOptConfig | None = part("poise.plan:TrajOptConfig", made=False)
     help_start: float = 100.0
     help_share: Annotated[float, Range(0, 1, above=True)] = 0.8
     help_by: Literal["all", "clip", "bin"] = "bin"
     adaptive_sampling: Share = 0.5
     adaptive_over: Literal["clip", "library"] = "clip"
     residual_std: float = 0.3
-    shares: Annotated[tuple[float, float], Range(0, 1, above=True, rising=True)] = (0.5, 0.8)
     evaluate_every: int = 0
     starts: Count = 1
     cooling: Share = 0.0
@@ -238,12 +219,6 @@ class Perpetual:
 
     def __post_init__(self) -> None:
         validate(self)
-        if self.recovery and self.shares[1] == 1:
-            what = "with recovery something must follow the last primitive, got shares up to 1"
-            raise PoiseError(what, "Perpetual", code="settings-conflict")
-        if self.recovering.primitive == "first" and self.max_primitives < 2:
-            what = "where the first primitive recovers there must be another, got max_primitives=1"
-            raise PoiseError(what, "Perpetual", code="settings-conflict")
         if self.goal == "keypoints" and self.action == "additive":
             what = "additive actions need the next frame's angles, of which keypoints tell nothing"
             raise PoiseError(
@@ -267,36 +242,11 @@ class Perpetual:
             raise PoiseError(
                 what, "Perpetual", "Set kl_target=None, or leave cooling out", code="settings-conflict"
             )
-        if self.trajopt is not None and self.shapes.several:
-            what = "trajectories are optimised for one body, and there are several shapes"
-            raise PoiseError(what, "Perpetual", "Leave one of the two out", code="settings-conflict")
         if self.ppo.learn_std:
             raise PoiseError(
                 "primitives keep their action noise",
                 "Perpetual",
                 "Set learn_std=False",
-                code="settings-conflict",
-            )
-        self._check_networks()
-
-    def _check_networks(self) -> None:
-        other = [n for n in ("multiplicative", "progressive") if not getattr(self, n)]
-        if len(other) + self.single > 1:
-            given = " and ".join([*(["single"] if self.single else []), *(f"no {n}" for n in other)])
-            what = f"only one of single, no multiplicative and no progressive can be, got {given}"
-            raise PoiseError(
-                what, hint="Each of them is another network; leave one out", code="settings-conflict"
-            )
-        if not self.progressive and self.combine != "product":
-            raise PoiseError(
-                "primitives that learn with their composer are combined as a product",
-                "Perpetual",
-                "Set combine='product'",
-                code="settings-conflict",
-            )
-        if not self.progressive and self.max_primitives < 2:
-            raise PoiseError(
-                "a composer without progressive training needs at least 2 primitives",
                 code="settings-conflict",
             )
 
@@ -320,45 +270,6 @@ class Perpetual:
         }  # fmt: skip
         return cls(action="additive", **(own | changes))
 
-    @classmethod
-    def paper(cls, **changes: Any) -> Perpetual:
-        """All that the paper states, for a GPU and a week. changes: settings that differ.
-
-        PPO, the number of worlds and what of the motion prior the paper leaves open (Sec. 3.1) are the
-        code's, see `code`. Of the two ways in which a primitive begins (Sec. 3.2), lateral connections
-        to random weights are taken; start="copy", lateral=False is the other.
-
-        Not expressed: the SMPL body with its gains (kd = 0.1 kp here as there), a composer with
-        weights that only have to be positive (softmax), and an episode that is worth nothing after its
-        last frame.
-        """
-        from poise.learn import AmpConfig, MiningConfig
-
-        own: dict[str, Any] = {
-            "faithful": "paper", "energy_form": "paper", "termination": "relaxed",
-            "style": AmpConfig.phc("paper"), "mining": MiningConfig.phc("paper"),
-            "start": "random", "lateral": True, "combine": "product", "weights": "softmax",
-        }  # fmt: skip
-        return cls(**(_phc() | own | changes))
-
-    @classmethod
-    def code(cls, **changes: Any) -> Perpetual:
-        """All that the authors' code does, of the version with the paper; changes: settings that differ.
-
-        Not expressed: action noise on the composer's weights (here on the actions), the energy weight of
-        0.00005 in the composer's stage alone, gains that differ between the SMPL body's joints, a critic
-        and a discriminator that share PPO's optimiser, a new set of clips in memory every 500 epochs,
-        fallen starts alone until a given epoch, and an episode that is worth nothing after its end.
-        """
-        from poise.learn import AmpConfig, MiningConfig
-
-        own: dict[str, Any] = {
-            "faithful": "code", "energy_form": "code", "termination": "code",
-            "style": AmpConfig.phc("code"), "mining": MiningConfig.phc("code"),
-            "start": "copy", "lateral": False, "combine": "means", "weights": "relu",
-        }  # fmt: skip
-        return cls(**(_phc() | own | changes))
-
     def taught(self) -> Perpetual:
         """The same settings with a teacher that looks ahead. What is observed and done suits it: the
         heading of the hips, later frames, a filter of actions. Most time is the teacher's, and few
@@ -379,73 +290,17 @@ class Perpetual:
     @property
     def method(self) -> str:
         """What a score card calls it."""
-        kinds = {"single": self.single, "plain": not self.multiplicative, "joint": not self.progressive}
-        return "-".join(["perpetual", *(name for name, other in kinds.items() if other)])
+        return "perpetual-single"
+
+    @property
+    def primitives(self) -> bool:
+        """Whether the policy is made of primitives and a composer."""
+        return False
 
     @property
     def help_limit(self) -> float:
         """N and N m that are left at the end."""
         return 0.0
-
-
-def _phc() -> dict[str, Any]:
-    """What `Perpetual.paper` and `.code` share. The paper: goals, absolute actions, no help, networks of
-    1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds,
-    steps."""
-    from poise.body import BodyConfig
-    from poise.learn import PPOConfig
-    from poise.sim import SimConfig
-
-    return {
-        "goal": "rotations",
-        "shape": False,
-        "heading": "twist",
-        "action": "absolute",
-        "energy": 0.0005,
-        "first": 0.0,
-        "recovery": True,
-        "recovering": RecoveryPlan(primitive="own", demonstrations=0),
-        "multiplicative": True,
-        "progressive": True,
-        "single": False,
-        "max_primitives": 3,
-        "composer_hidden": (1024, 512),
-        "composer_clone": False,
-        "expert": False,
-        "trajopt": None,
-        "help_start": 0.0,
-        "help_by": "all",
-        "adaptive_sampling": 0.0,
-        "adaptive_over": "clip",
-        "cooling": 0.0,
-        "num_envs": 3072,
-        "horizon": 300,
-        "body": BodyConfig(damping=0.1, armature=0.02),
-        "sim": SimConfig(rate_hz=60.0, control_hz=30.0),
-        "ppo": PPOConfig(
-            horizon=32,
-            minibatch=16_384,
-            epochs=6,
-            gamma=0.99,
-            lam=0.95,
-            clip=0.2,
-            policy_lr=2e-5,
-            value_lr=2e-5,
-            policy_grad_norm=50.0,
-            value_grad_norm=50.0,
-            policy_hidden=(1024, 512),
-            value_hidden=(1024, 512),
-            activation="relu",
-            std=math.exp(-2.9),
-            bound_weight=10.0,
-            bound_limit=1.0,
-            kl_target=None,
-            kl_stop=None,
-            normalise_returns=True,
-            obs_clip=5.0,
-            bootstrap_timeouts=True,
-        ),
-    }
 
 
 #: What earlier versions called the settings, and what their runs did that name none.
@@ -468,6 +323,30 @@ MIGRATION = Migration(
 )  # fmt: skip
 
 
-def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Perpetual:
-    """The settings that a run or a policy file holds as JSON data, also of earlier versions."""
-    return from_data(Perpetual, MIGRATION(data), where)
+#: Settings that a run by stages has besides, by which it is known, and the class of its settings.
+STAGED = frozenset(
+    (
+        *("multiplicative", "progressive", "single", "max_primitives", "start", "lateral", "combine"),
+        *("weights", "composer_hidden", "composer_clone", "trajopt", "shares"),
+    )
+)
+BY_STAGES = "poise.papers.perpetual.ablations:StagedPerpetual"
+
+
+def config_of(
+    data: Mapping[str, Any], where: Path | str | None = None, kind: type[Perpetual] | None = None
+) -> Perpetual:
+    """The settings that a run or a policy file holds as JSON data, also of earlier versions.
+
+    kind: the class of the settings; by default that of `BY_STAGES` where they are not of one network.
+    """
+    data = MIGRATION(data)
+    staged = STAGED & data.keys()
+    if kind is None:
+        kind = imported(BY_STAGES) if staged and not data.get("single", False) else Perpetual
+    assert kind is not None
+    if kind is Perpetual:
+        data = {name: value for name, value in data.items() if name not in STAGED}
+    elif not staged:
+        data["single"] = True
+    return from_data(kind, data, where)

@@ -112,7 +112,7 @@ def recovery_card(
             before the trials goes on standing on its last frame. It waits for the fallen as in training.
         near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
         at_once: trials that are simulated side by side.
-        recovery_clips: what the policy is led back by (`env.led`), where the task is for that; by
+        recovery_clips: what the policy is led back by (`env.recovery`), where the task is for that; by
             default it is told a point.
 
     Raises:

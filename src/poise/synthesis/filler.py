@@ -14,16 +14,17 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.kinematics.feet import Motion
 from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.steps import lock_feet, planted, stepped
 from poise.learn.between import Between
-from poise.learn.inbetween import Adaptation, InbetweenModel, adapt
+from poise.learn.inbetween_model import Adaptation, InbetweenModel, adapt
 from poise.learn.transition import FilledGap, Known
 from poise.learn.transition import FilledGap as Transition
 from poise.motion.clip import Clip
 from poise.motion.roles import map_joints
 from poise.motion.rotations import (
-    forward_kinematics,
     normalize,
     quat_between,
     quat_mul,
@@ -31,9 +32,7 @@ from poise.motion.rotations import (
     slerp,
     unwrap_quats,
 )
-from poise.synthesis.footsteps import lock_feet, stepped
-from poise.synthesis.limits import Calmed, Feet, Motion, calmed, excess, flown, meet, sampled, spread
-from poise.synthesis.steps import planted
+from poise.synthesis.limits import Calmed, Feet, calmed, excess, flown, meet, sampled, spread
 
 
 class Gap(NamedTuple):
@@ -104,9 +103,6 @@ def split_gaps(keyframes: Sequence[int], longest: float) -> tuple[list[Gap], lis
     return gaps, inserted, warnings
 
 
-Path = tuple[Tensor, Tensor]
-
-
 @dataclass(frozen=True, eq=False)
 class OtherRig:
     """The passage between a clip's skeleton and a network's. A path is root `(T, 3)` m and rot
@@ -129,26 +125,28 @@ class OtherRig:
         back = Retargeter(joints, there.there, there.here, there.scale.inverse())
         return OtherRig(clip, example, there, back)
 
-    def to_model(self, path: Path) -> Path:
+    def to_model(self, path: Motion) -> Motion:
         """A path of the clip's skeleton on the network's."""
         return self._passed(self.clip, self.there, path)
 
-    def to_clip(self, path: Path) -> Path:
+    def to_clip(self, path: Motion) -> Motion:
         """A path of the network's skeleton on the clip's."""
         return self._passed(self.example, self.back, path)
 
-    def changed(self, known: Path, filled: Path) -> Path:
-        """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it."""
+    def changed(self, known: Motion, filled: Motion) -> Motion:
+        """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it.
+
+        With P the passage there and B the passage back, x B(P(x))^-1 B(f), joint by joint and likewise
+        for the root's place: where the network changes nothing, the clip stays to the last digit.
+        """
         before, after = self.to_clip(self.to_model(known)), self.to_clip(filled)
         root = known[0] + after[0] - before[0]
         turn = quat_between(before[1], after[1])
         return root, unwrap_quats(normalize(quat_mul(known[1], turn)))
 
     @staticmethod
-    def _passed(clip: Clip, passage: Retargeter, path: Path) -> Path:
-        skeleton = clip.skeleton
-        world = ClipWorld(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
-        rot, root = passage.transfer(world)
+    def _passed(clip: Clip, passage: Retargeter, path: Motion) -> Motion:
+        rot, root = passage.transfer(ClipWorld(*clip.skeleton.forward(*path)))
         return root, unwrap_quats(normalize(rot))
 
 
@@ -352,7 +350,8 @@ class Filler:
             self._finish(root, rot, gap, contact if holds else contact[:, :0])
             if flight is not None and feet == "held":
                 here, off = slice(a, b + 1), (before > 0.0, after > 0.0)
-                moved = planted(self.own.skeleton, (root[here], rot[here]), off, flight, self.own.fps)
+                how = off, flight.lean, flight.falls, self.own.fps
+                moved = planted(self.own.skeleton, (root[here], rot[here]), *how)
                 root[here], rot[here] = moved
             if feet == "stepped":
                 here = slice(a, b + 1)

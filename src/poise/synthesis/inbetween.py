@@ -14,7 +14,8 @@ from torch import Tensor
 from poise.errors import PoiseError, did_you_mean
 from poise.formats.own import unpack_clips
 from poise.kinematics.directed import LIMBS, PELVIS, TouchPoint, end_of
-from poise.learn.inbetween import InbetweenModel
+from poise.kinematics.feet import off_floor, standing_heights, under_floor
+from poise.learn.inbetween_model import InbetweenModel
 from poise.motion import Clip
 from poise.motion.rotations import slerp
 from poise.motion.windows import foot_joints, still_root, without_still_root
@@ -27,16 +28,7 @@ from poise.synthesis.filler import (
     interpolated,
     split_gaps,
 )
-from poise.synthesis.limits import (
-    ALOFT_M,
-    Calmed,
-    fastest,
-    flight_speeds,
-    off_floor,
-    sampled,
-    standing_heights,
-    under_floor,
-)
+from poise.synthesis.limits import ALOFT_M, Calmed, fastest, flight_speeds, sampled
 from poise.synthesis.rounds import GapFault, best_of_rounds
 from poise.synthesis.rounds import told as named
 

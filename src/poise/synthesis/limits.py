@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError
+from poise.kinematics.feet import Motion
+from poise.kinematics.steps import hermite
 from poise.motion import Skeleton
 from poise.motion.rotations import (
     GRAVITY,
-    forward_kinematics,
     normalize,
     quat_conj,
     quat_mul,
@@ -23,6 +23,7 @@ from poise.motion.rotations import (
     slerp,
     unwrap_quats,
 )
+from poise.motion.smoothing import smoothstep
 
 #: m/s, the fastest of a thousand frames of each part in CMU's motions and DeepMimic's (30 Hz, 62 clips).
 FASTEST = {
@@ -42,16 +43,8 @@ FASTEST = {
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: m above its height on the floor from which on a body is in the air.
 ALOFT_M = 0.12
-#: m under the floor from which on a keyframe is no longer a foot that sank in.
-UNDER_M = 0.1
-
-#: Of the heights of the lower foot in frames that are kept, this share is where it stands.
-_STANDS = 0.3
-
-#: Root `(T, 3)` m and rotations `(T, J, 4)`.
-Motion = tuple[Tensor, Tensor]
 #: What is done with the feet of a gap: held where the network says that they stand, led from one place
-#: where they stand to the next (`synthesis.footsteps`), or left alone.
+#: where they stand to the next (`kinematics.steps`), or left alone.
 Feet = Literal["held", "stepped", "free"]
 
 
@@ -69,8 +62,7 @@ def fastest(skeleton: Skeleton) -> Tensor:
 
 def excess(skeleton: Skeleton, limits: Tensor, motion: Motion, fps: float) -> tuple[float, int]:
     """By how much the fastest joint goes beyond its limit, as a factor, and which one it is."""
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
-    pos = forward_kinematics(skeleton.parents, offsets, *motion)[0]
+    pos = skeleton.forward(*motion)[0]
     over = (pos.diff(dim=0).norm(dim=-1) * fps).amax(0) / limits
     joint = int(over.argmax())
     return float(over[joint]), joint
@@ -124,42 +116,6 @@ def calmed(
                 best = tried
     assert best is not None
     return best
-
-
-def lowest(skeleton: Skeleton, motion: Motion) -> Tensor:
-    """`(T,)` m, the height of the lowest joint."""
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
-    return forward_kinematics(skeleton.parents, offsets, *motion)[0][..., 2].amin(-1)
-
-
-def off_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
-    """`(T,)` m, how much higher the lowest joint is than in the frames that stand, of all given."""
-    low = lowest(skeleton, motion)
-    return low - low.quantile(0.1)
-
-
-def standing_heights(skeleton: Skeleton, motion: Motion) -> tuple[float, float]:
-    """m, how high the ankle and the toes are of the lower foot, in most frames; 0 without feet."""
-    try:
-        anatomy = find_anatomy(skeleton)
-    except PoiseError:
-        return 0.0, 0.0
-    ankles, toes = anatomy.of("foot"), [toe for _, toe in anatomy.toes]
-    if not ankles or not toes:
-        return 0.0, 0.0
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
-    height = forward_kinematics(skeleton.parents, offsets, *motion)[0][..., 2]
-    low = (height[:, list(some)].amin(-1).quantile(_STANDS) for some in (ankles, toes))
-    ankle, toe = (float(x) for x in low)
-    return ankle, toe
-
-
-def under_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
-    """`(T,)` m that the lowest joint lies under the floor at 0; 0 where it does not, or where most
-    frames lie as low, since their floor then is elsewhere."""
-    low = lowest(skeleton, motion)
-    deep = (low < -UNDER_M) & (low < low.median() - UNDER_M)
-    return torch.where(deep, -low, torch.zeros_like(low))
 
 
 #: Depth of the crouch before and after a jump, as a share of its height, and between which it lies, m; s
@@ -332,12 +288,6 @@ def _ahead(
     return torch.where((whole - t < falls[1])[:, None], ends[1] - (whole - t)[:, None] * v[1], out)
 
 
-def hermite(u: Tensor, start: Tensor, stop: Tensor, leave: Tensor, reach: Tensor) -> Tensor:
-    """The cubic from `start` to `stop` at `u` from 0 to 1, with its derivatives at both ends."""
-    rise = u * u * (3.0 - 2.0 * u)
-    return start + rise * (stop - start) + u * (1.0 - u) ** 2 * leave - u * u * (1.0 - u) * reach
-
-
 def _crouch(since: Tensor, depth: float, push: float, room_s: float) -> Tensor:
     """How deep (m) a body crouches, `since` seconds before it takes off or after it landed.
 
@@ -397,7 +347,7 @@ def spread(ends: tuple[Tensor, Tensor], made: tuple[Tensor, Tensor]) -> tuple[Te
     if n < 2:
         return root.clone(), rot.clone()
     t = torch.arange(1, n + 1, dtype=root.dtype) / (n + 1)
-    ease = t * t * (3 - 2 * t)
+    ease = smoothstep(t)
     shift, turn = torch.zeros_like(root), torch.zeros(n, rot.shape[1], 3, dtype=rot.dtype)
     for k, (a, b), weight in ((0, (1, 0), 1 - ease), (1, (n - 2, n - 1), ease)):
         place, pose = _ahead_seams(root, rot, a, b)
@@ -442,7 +392,7 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
         # y(i) += s(i) (x(n+1) - (2 y(n) - y(n-1))),  s from 0 to 1 along a smooth step
         t = (torch.arange(n, dtype=root.dtype) - (n - 1 - min(blend, n - 1))).clamp_min(0)
         t = t / (min(blend, n - 1) + 1)
-        ease = t * t * (3 - 2 * t)
+        ease = smoothstep(t)
         place, pose = _ahead_seams(root, rot, before + n - 2, before + n - 1)
         shift += ease[:, None] * (root[before + n] - place)
         turn += ease[:, None, None] * quat_to_rotvec(quat_mul(rot[before + n], quat_conj(pose)))

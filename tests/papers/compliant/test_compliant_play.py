@@ -13,7 +13,7 @@ from poise.control import Stiffness
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.papers.compliant.play import WORDS, play
+from poise.papers.compliant.scene_play import WORDS, play
 from poise.papers.compliant.scenes import (
     Balance,
     Chicken,
@@ -24,6 +24,7 @@ from poise.papers.compliant.scenes import (
     TrampolineScene,
 )
 from poise.papers.compliant.watch import footfalls
+from poise.plan import LookaheadConfig
 from refusals import refused
 from toy_policy import WALK
 
@@ -102,8 +103,9 @@ def test_on_a_trampoline(tracker: Tracker) -> None:
 
 def test_lookahead_tries_in_copies_of_the_scene(tracker: Tracker) -> None:
     scene, tight = TrampolineScene(0.1, first=0.2), {"count": 1, "seconds": 0.6, "threads": 1}
+    few = LookaheadConfig(candidates=20)
     alone, ahead, again = (
-        play(scene, tracker, None, None, controller=c, **tight)  # type: ignore[arg-type]
+        play(scene, tracker, None, None, controller=c, lookahead=few, **tight)  # type: ignore[arg-type]
         for c in ("policy", "lookahead", "lookahead")
     )
     # The plate does as it does without, and the same is done again.

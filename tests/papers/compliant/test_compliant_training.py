@@ -15,9 +15,8 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.papers.compliant.play import play
-from poise.papers.compliant.scenes.ball import FictionalForces
-from poise.papers.compliant.training import (
+from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.scene_training import (
     Added,
     Compliant,
     OnTop,
@@ -27,6 +26,7 @@ from poise.papers.compliant.training import (
     shipped,
     train,
 )
+from poise.papers.compliant.scenes.ball import FictionalForces
 from refusals import refused
 
 PPO = PPOConfig(

@@ -116,9 +116,9 @@ def test_an_episode_ends_half_a_metre_too_low(full: Imitation) -> None:
 
 
 def test_it_learns_and_the_force_becomes_less() -> None:
-    config = settings("full", Budget(num_envs=64, iterations=12), seed=1)
+    config = settings("full", Budget(num_envs=32, iterations=12), seed=1)
     assert isinstance(config, ResidualForce)
-    trainer = build(swing(2.0), config).trainer(threads=1)
+    trainer = build(swing(1.0), config).trainer(threads=1)
     rewards = [trainer.iterate().reward for _ in range(12)]
     assert np.mean(rewards[-3:]) > np.mean(rewards[:3])
     assert trainer.env.help.now == pytest.approx(LEFT / INITIAL, abs=0.1)  # type: ignore[attr-defined]

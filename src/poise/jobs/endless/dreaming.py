@@ -123,9 +123,11 @@ def dream(
         for writer in writers:
             writer.discard()
     return Dreamt(
-        tracker, body, tuple(characters),
-        tuple((i, s / rate) for i, s in goal.lost), tuple((i, s / rate) for i, s in goal.back),
-        tuple((i, s / rate) for i, s in goal.reached), config, (*notes, *goal.notes), paths, interrupted,
+        tracker=tracker, body=body, characters=tuple(characters),
+        lost=tuple((i, s / rate) for i, s in goal.lost),
+        back=tuple((i, s / rate) for i, s in goal.back),
+        reached=tuple((i, s / rate) for i, s in goal.reached), config=config,
+        notes=(*notes, *goal.notes), paths=paths, interrupted=interrupted,
     )  # fmt: skip
 
 

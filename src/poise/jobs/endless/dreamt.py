@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -21,10 +21,10 @@ import torch
 from poise.body import BodyTable, Humanoid
 from poise.env.generator import Steering
 from poise.errors import PoiseError
-from poise.formats import check_writable, home_suffix, write_clip
+from poise.formats import check_writable, write_clip
 from poise.formats.text import write_whole
-from poise.jobs.result import Result, ResultView
-from poise.jobs.tracker import Tracker
+from poise.jobs.deliver import Delivery
+from poise.jobs.result import ABSENT, Result
 from poise.kinematics import hold_feet, lowest_height, qpos_to_clip
 from poise.kinematics.forward import Kinematics, shapes_of
 from poise.metrics import foot_points, foot_slide, jerk, lowest_points, penetration
@@ -256,40 +256,36 @@ class Dreamt(Result):
             target.
         config: how they went about. notes: sentences.
         paths: motion files that were written on the way.
-        interrupted: whether Ctrl-C ended it.
     """
 
-    tracker: Tracker
-    body: ClipMaker
-    characters: tuple[DreamtCharacter, ...]
-    lost: tuple[tuple[int, float], ...]
-    back: tuple[tuple[int, float], ...]
-    reached: tuple[tuple[int, float], ...]
-    config: Dream
-    notes: tuple[str, ...] = ()
+    body: ClipMaker = ABSENT
+    characters: tuple[DreamtCharacter, ...] = ()
+    lost: tuple[tuple[int, float], ...] = ()
+    back: tuple[tuple[int, float], ...] = ()
+    reached: tuple[tuple[int, float], ...] = ()
+    config: Dream = ABSENT
     paths: tuple[Path, ...] = ()
-    interrupted: bool = False
 
     @property
     def seconds(self) -> float:
         """How long the motion is."""
         return self.characters[0].done.count / self.body.fps
 
-    @property
-    def motion(self) -> Clip:
-        """The first character's motion as it was simulated, on the body's skeleton."""
-        return self.body.clip(self.characters[0].done.read(), "dream")
+    def motion(self, character: int = 0) -> Clip:
+        """A character's motion as it was simulated, on the body's skeleton."""
+        return self.body.clip(self.characters[character].done.read(), "dream")
 
     @property
-    def asked(self) -> Clip:
-        """What the kinematic policy made for it, in the same frames."""
+    def source(self) -> Clip:
+        """What the kinematic policy made for the first character, in the same frames."""
         return self.body.clip(self.characters[0].asked.read(), "asked")
 
-    @property
-    def clip(self) -> Clip:
-        """The first character's motion as it is written."""
-        motion = self.motion
-        return hold_feet(motion, self.body.table)[0] if self.config.hold_feet else motion
+    def as_written(self, hold: bool) -> Delivery:
+        """The first character's motion, and what the kinematic policy asked for."""
+        motion = self.motion()
+        held = hold_feet(motion, self.body.table)[0] if hold and self.config.hold_feet else motion
+        clips = {"simulated": held, "asked": self.source}
+        return Delivery(clips, clips, ABSENT, ())
 
     @property
     def falls(self) -> tuple[float, ...]:
@@ -361,7 +357,12 @@ class Dreamt(Result):
             **figures,
         }  # fmt: skip
 
-    def write(self, folder: Path) -> dict[str, Path]:
+    def write(self, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
+        """Writes both motions, score.json and report.html into a folder."""
+        done = super().write(out, motion, hold)
+        return replace(done, paths={**done.paths, **self.write_score(out)})
+
+    def write_score(self, folder: Path) -> dict[str, Path]:
         """Writes score.json and report.html into a folder."""
         folder.mkdir(parents=True, exist_ok=True)
         paths = {"score": folder / "score.json", "report": folder / "report.html"}
@@ -369,7 +370,7 @@ class Dreamt(Result):
         write_report(self.report(), paths["report"])
         return paths
 
-    def report(self) -> Report:
+    def report(self, done: Delivery | None = None) -> Report:
         """A page that shows the first minute of the first character, and of the others with it."""
         humanoid, fps = self.tracker.humanoid, self.body.fps
         kinematics, frames = Kinematics(humanoid.table), round(SHOWN_S * fps)
@@ -407,16 +408,6 @@ class Dreamt(Result):
             notes=(self.sentence, *self.notes), facts=facts,
             others=tuple(track(c.done, f"character {k}") for k, c in enumerate(others, 2)),
         )  # fmt: skip
-
-    def _shown(self) -> ResultView:
-        return ResultView(self.clip, self.asked, None, (self.sentence, *self.notes))
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        paths: dict[str, Path] = {}
-        for name, clip in (("simulated", self.clip), ("asked", self.asked)):
-            paths[name] = folder / f"{name}{home_suffix(clip)}"
-            write_clip(clip, paths[name])
-        return paths | self.write(folder)
 
 
 #: Room for the number of frames in a file's header.

@@ -7,57 +7,16 @@ made.clip, made.save("filled.bvh")
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 from poise.errors import PoiseError
-from poise.formats import home_suffix, write_clip
-from poise.jobs.result import Result, ResultView, clip_of
-from poise.learn.inbetween import MODEL, InbetweenModel, load_model
+from poise.jobs.result import Result, clip_of
+from poise.learn.inbetween_model import MODEL, InbetweenModel, load_model
 from poise.motion import Clip
 from poise.synthesis.filler import EACH_GAP, Filling, check_keyframes
 from poise.synthesis.inbetween import fill_keyframes
-from poise.synthesis.rounds import GapFault
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Inbetweened(Result):
-    """What came of filling keyframes; nothing is simulated, so there is no score.
-
-    clips: the first is the best guess, the others are variants. source: what came in. keyframes: its
-    frames that stayed. warnings: what is doubtful. over: see `synthesis.inbetween.Filled`. faults: what
-    the doctor finds in the gaps after all that was tried, clip by clip.
-    """
-
-    clips: tuple[Clip, ...]
-    source: Clip
-    keyframes: tuple[int, ...]
-    warnings: tuple[str, ...]
-    over: tuple[float, ...] = ()
-    faults: tuple[GapFault, ...] = ()
-    card: None = None
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is doubtful, and what was guessed about the file, in sentences."""
-        return (*(f"{w}." for w in self.warnings), *self.source.skeleton.source.notes)
-
-    @property
-    def clip(self) -> Clip:
-        """The best guess."""
-        return self.clips[0]
-
-    def _shown(self) -> ResultView:
-        return ResultView(self.clip, self.source, None, self.notes, self.keyframes)
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        paths: dict[str, Path] = {}
-        for k, clip in enumerate(self.clips):
-            name = "filled" if len(self.clips) == 1 else f"filled-{k}"
-            paths[name] = folder / f"{name}{home_suffix(clip)}"
-            write_clip(clip, paths[name])
-        return paths
 
 
 def inbetween(
@@ -70,7 +29,7 @@ def inbetween(
     adapt: int = EACH_GAP.iterations,
     seed: int = 0,
     on_gap: Callable[[int, int], None] | None = None,
-) -> Inbetweened:
+) -> Result:
     """Makes everything between keyframes of a clip anew; keyframes and all other frames stay.
 
     Args:
@@ -91,7 +50,8 @@ def inbetween(
     adaptation = replace(EACH_GAP, iterations=adapt) if adapt else None
     filling = Filling(samples, foot_lock, adaptation=adaptation, seed=seed)
     filled = fill_keyframes(source, keys, net, filling, on_gap)
-    return Inbetweened(filled.clips, source, tuple(keys), filled.warnings, filled.over, filled.faults)
+    notes = (*(f"{w}." for w in filled.warnings), *source.skeleton.source.notes)
+    return Result(filled=filled, came=source, keyframes=tuple(keys), notes=notes)
 
 
 def shipped_model(path: str | Path | None = None) -> Path:

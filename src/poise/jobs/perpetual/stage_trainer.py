@@ -20,27 +20,7 @@ from poise.jobs.perpetual.evaluation import (
     mean_help,
     try_recovery,
 )
-from poise.jobs.perpetual.stage_order import (
-    Progress,
-    Stage,
-    ends,
-    first_recovers,
-    following,
-    is_over,
-    lasts,
-    most_help,
-    primitives,
-)
-from poise.jobs.perpetual.stage_start import (
-    DUMPS,
-    begin_first,
-    begin_stage,
-    critic_of,
-    make_trainer,
-    members_of,
-    odds,
-    staged,
-)
+from poise.jobs.perpetual.stages import DUMPS, Progress, Stage, critic_of, odds, order_of, staged
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import (
     LATEST,
@@ -207,6 +187,7 @@ class StageTrainer:
     ):
         self.imitation, self.folder, self.until = imitation, folder, until
         self.config: Perpetual = imitation.config
+        self.order = order_of(self.config)
         self.threads, self.device, self.save_s = threads, device, save_s
         self.tensorboard = tensorboard
         self.dumps, self.tell = folder / DUMPS, tell or TrainingCallbacks()
@@ -219,10 +200,10 @@ class StageTrainer:
             remove_partial(folder)
         else:
             check_falls(imitation)
-            stage, start = begin_first(imitation, threads, folder, self.tell, trained)
+            stage, start = self.order.begin(imitation, threads, folder, self.tell, trained)
             warm = start is not None and (start.critic is not None or trained is not None)
             if stage.kind == "recovery":
-                self.stage_record.begin(members_of(stage, torch.zeros(0), imitation))
+                self.stage_record.begin(self.order.members(stage, torch.zeros(0), imitation))
             self._enter(stage, start, warm, 1.0)
             # What the clone has cost is no time with help.
             self.begun = self.trainer.samples, self.trainer.seconds
@@ -231,7 +212,7 @@ class StageTrainer:
         self.log = Log(folder, self.iteration, tensorboard)
         self._saved_at, self._save_took = time.monotonic(), 0.0
         if not (folder / LATEST).exists():
-            if trained is not None and first_recovers(self.config):
+            if trained is not None and self.order.given_first:
                 # It is the first primitive as it is: what it fails is for the next one.
                 self._advance(self._judge(over=True))
             self.save()
@@ -270,12 +251,12 @@ class StageTrainer:
     @property
     def primitives(self) -> int:
         """Primitives of tracking that were begun; 0 for a network that learns all clips at once."""
-        return primitives(self.config, self.stage)
+        return self.order.primitives(self.stage)
 
     @property
     def recovers(self) -> bool:
         """Whether the stage's policy learned to recover."""
-        given = first_recovers(self.config) and self.stage.number == 1
+        given = self.order.given_first and self.stage.number == 1
         return given or self.stage.recovers is not None
 
     @property
@@ -303,13 +284,13 @@ class StageTrainer:
         row = stats.row() | {"iteration": iteration, "stage": stage.number}
         seen = self.stage_record.seen
         every = self.judge.every(stage, self.trainer.rollout.samples)
-        over = share >= ends(self.config, stage, self.began)
+        over = share >= self.order.ends(stage, self.began)
         if over or self.trainer.iteration % every == 0:
             judged = self._judge(over)
             self.troubles[1] = 0
             seen = self.stage_record.seen
             row |= judged.row()
-            if is_over(self.config, stage, judged.decision, share):
+            if self.order.is_over(stage, judged.decision, share):
                 follows = self._advance(judged)
         self.log.write(row)
         due = SAVES * self._save_took if self.save_s is None else self.save_s
@@ -352,14 +333,14 @@ class StageTrainer:
         """No more help, on any clip, than the stage's time allows."""
         if self.imitation.task.residual is None:
             return
-        most = most_help(self.config, self.stage, self.began, self.share)
+        most = self.order.most_help(self.stage, self.began, self.share)
         if most == 0.0:
             self.env.help.schedule = None
         self.env.help.cap(most)
 
     def _cool(self) -> None:
         """Smaller steps towards the stage's end, see `Perpetual.cooling`."""
-        cooling, end = self.config.cooling, ends(self.config, self.stage, self.began)
+        cooling, end = self.config.cooling, self.order.ends(self.stage, self.began)
         if cooling and end > self.began:
             left = (end - self.share) / (end - self.began)
             self.trainer.ppo.cool(left, cooling)
@@ -377,10 +358,10 @@ class StageTrainer:
         stage, stage_record, t = self.stage, self.stage_record, self.trainer
         member, policy = stage_record.mining.member.clone(), self.policy()
         hard = torch.zeros_like(member) if judged.decision == "solved" else stage_record.hard
-        follows = following(self.config, stage, bool(hard.any()))
+        follows = self.order.following(stage, bool(hard.any()))
         if stage.kind == "primitive":
             stage_record.owner[member] = stage.number - 1
-        if stage.kind in ("primitive", "recovery") and not lasts(self.config, stage):
+        if stage.kind in ("primitive", "recovery") and not self.order.lasts(stage):
             about = {"stage": stage.name, "clips": int(member.sum()), "hard": int(hard.sum())}
             name = stage.name.replace(" ", "-")
             policy.save(self.folder / f"{name}.safetensors", t.character, about)
@@ -389,12 +370,12 @@ class StageTrainer:
             return None
         before = WarmStart(policy, critic_of(t), t.samples, t.seconds)
         where = (self.threads, self.dumps, self.tell)
-        start = begin_stage(before, self.imitation, follows, stage_record.owner, *where)
+        start = self.order.next(before, self.imitation, follows, stage_record.owner, *where)
         # A composer and what recovers learn without help; a primitive's clips keep what they have.
         scale = self.helps if follows.kind == "primitive" else 0.0
         self.before, self.begun = self.iteration, (start.samples, start.seconds)
         self.trainer.close()
-        stage_record.begin(members_of(follows, hard, self.imitation))
+        stage_record.begin(self.order.members(follows, hard, self.imitation))
         self._enter(follows, start, True, scale)
         if isinstance(self.trainer.style, Amp) and isinstance(t.style, Amp):
             # The discriminator goes on, as in the paper.
@@ -405,7 +386,7 @@ class StageTrainer:
         """Makes the stage's trainer, with the share `scale` of the help, or each group's own `(G,)`."""
         self.stage, self.warm = stage, warm
         where = (self.threads, self.dumps, self.device)
-        self.trainer: Trainer = make_trainer(self.imitation, stage, start, warm, *where)
+        self.trainer: Trainer = self.order.trainer(self.imitation, stage, start, warm, *where)
         self.env.help.set(scale)
         self._use_odds()
 

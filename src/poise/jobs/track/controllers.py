@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,6 +12,7 @@ from torch import Tensor
 from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.result import RULE, merit
 from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
 from poise.jobs.track.recovering import RecoveryRun, ReplayActions, led_along, look_for, replay
@@ -22,63 +22,12 @@ from poise.jobs.tracker import Tracker
 from poise.metrics import has_lost, success_rule
 from poise.plan import Lookahead, LookaheadConfig, SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
-from poise.score import ScoreCard, run_episodes, score_rollouts
+from poise.score import run_episodes
 from poise.score.episodes import ContactForces, Recording
 from poise.score.rollouts import EpisodeOutcomes, RolloutSet, judge
 
 if TYPE_CHECKING:
-    from poise.jobs.track.settings import TrackConfig
-
-
-#: The rule by which a motion is lost: a mean distance of more than `metrics.LOST`.
-RULE = "phc"
-#: How an attempt ended.
-LOST, SURVIVED, TRACKED = 0, 1, 2
-#: Steps within which attempts are alike: mm of error, shares of the reference's jerk, mm/s of slide.
-ERROR_MM, JERK, SLIDE = 10.0, 0.1, 10.0
-
-
-class Merit(NamedTuple):
-    """How good an attempt is, as a tuple of which the larger one is better.
-
-    Attributes:
-        ended: `TRACKED`, `SURVIVED` or `LOST`.
-        unhelped: less the mean force of help, N; 0 without any, and of what is lost.
-        reached: s before it was lost; inf where it was not.
-        error, jerk, slide: less the steps that each is.
-    """
-
-    ended: int
-    unhelped: float
-    reached: float
-    error: float = 0.0
-    jerk: float = 0.0
-    slide: float = 0.0
-
-    @staticmethod
-    def of(card: ScoreCard) -> Merit:
-        """Of the score of a single episode."""
-        fails = card.per_clip[0]["first_fail_s"]
-        ended = LOST if card.succ < 1.0 else SURVIVED if card.survived else TRACKED
-        usual = card.reference.get("jerk", math.nan)
-        return Merit(
-            ended,
-            -card.help.force_mean_n if ended else 0.0,
-            math.inf if ended else fails,
-            _steps(card.mpjpe_global_mm, ERROR_MM),
-            _steps(card.jerk / usual if usual else math.nan, JERK),
-            _steps(card.foot_slide_mm_per_s, SLIDE),
-        )
-
-
-def merit(rollouts: RolloutSet, row: int = 0) -> Merit:
-    """Of one of some episodes."""
-    return Merit.of(score_rollouts(rollouts.episode(row), rule=RULE))
-
-
-def _steps(value: float, step: float) -> float:
-    """Less the whole steps of a figure; one that was not measured is the worst."""
-    return -float(math.floor(value / step)) if math.isfinite(value) else -math.inf
+    from poise.jobs.track_settings import TrackConfig
 
 
 #: Is told what is done, and how many control steps of how many are done.

@@ -12,15 +12,14 @@ import torch
 from poise.env import Reference
 from poise.jobs.open import policy_of_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.perpetual.run import PerpetualResult, begin, going_on, train
-from poise.jobs.perpetual.stage_order import Progress
+from poise.jobs.perpetual.perpetual_run import PerpetualResult, begin, going_on, train
+from poise.jobs.perpetual.stages import Progress
+from poise.jobs.result import RULE, Result, needs_of
 from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
-from poise.jobs.track.controllers import RULE
 from poise.jobs.track.placement import PlacedMotion, place
 from poise.jobs.track.supports import Wanted, with_supports
-from poise.jobs.track.tracked import Tracked, needs_of
-from poise.jobs.track.tracking import imitation_of
+from poise.jobs.track.tracking import BESIDE, brought_home, imitation_of
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened
 from poise.kinematics.repair.estimate import clean_clip
@@ -167,10 +166,8 @@ def help_wanted(tracker: Tracker, placed: PlacedMotion, seed: int = 0, threads: 
     return None
 
 
-def from_every_start(
-    tracker: Tracker, source: Clip, device: str = "cpu", help_n: float = 0.0
-) -> Tracked:
-    """A motion as the policy alone does it from every start frame: `Tracked.card` is that of all.
+def from_every_start(tracker: Tracker, source: Clip, device: str = "cpu", help_n: float = 0.0) -> Result:
+    """A motion as the policy alone does it from every start frame: `Result.card` is that of all.
 
     The failures are those of the episode from the first frame, which is the motion that is delivered.
 
@@ -189,10 +186,20 @@ def from_every_start(
     failed = judge(done.rollouts, success_rule(RULE)).failed_at[done.recordings[0].row].item()
     lost = ((0, failed / task.reference.rate_hz),) if failed >= 0 else ()
     notes = (*placed.notes, *(s.sentence() for s in supports))
-    return Tracked(tracker, task, done, placed, lost, None, notes, supports=supports)
+    return Result(
+        task,
+        done,
+        tracker,
+        placed,
+        notes,
+        failures=lost,
+        supports=supports,
+        ways=(brought_home(),),
+        beside=BESIDE,
+    )
 
 
-def with_help(tracker: Tracker, source: Clip, device: str = "cpu") -> Tracked | None:
+def with_help(tracker: Tracker, source: Clip, device: str = "cpu") -> Result | None:
     """The same with the least of some shares of the help that the policy learned with, by which it does
     the motion from its first frame; None where none suffices."""
     placed, most = place(source, tracker), tracker.config.help_start

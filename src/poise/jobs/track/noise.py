@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.track.settings import Controller, TrackConfig
 from poise.jobs.track.tracking import track
+from poise.jobs.track_settings import Controller, TrackConfig
 from poise.jobs.tracker import Tracker
-from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import (
@@ -34,7 +31,6 @@ from poise.motion.noise import (
     robustness_levels,
     scaled,
 )
-from poise.score.report.svg import line_plot
 from poise.settings import plain
 
 #: What noise may be called; "video" and "triangulated" are everything that goes wrong with one camera,
@@ -160,24 +156,6 @@ def robustness(
         rungs.append(Rung(level.name, level.strength, len(rows), *_means(rows)))
         tell(f"{level.name}: {100 * rungs[-1].succ:.0f} % of {len(rows)} motions succeed")
     return Robustness(tuple(rungs), tuple(refused))
-
-
-def write_robustness(result: Robustness, folder: Path) -> dict[str, Path]:
-    """Writes `robustness.json` and `robustness.svg`, success over the strength of the noise."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = {"json": folder / "robustness.json", "plot": folder / "robustness.svg"}
-    write_atomic(paths["json"], json.dumps(result.to_dict(), indent=2, allow_nan=False).encode())
-    ladders: dict[str, list[Rung]] = {}
-    for rung in result.rungs:
-        ladders.setdefault(rung.name.rpartition(" x")[0] or "all", []).append(rung)
-    clean = [r for r in ladders.get("all", ()) if r.strength == 0]
-    series: list[tuple[str, list[float], list[float]]] = []
-    for name, rungs in ladders.items():
-        line = rungs if name == "all" else [*clean, *rungs]
-        series.append((name, [r.strength for r in line], [100 * r.succ for r in line]))
-    about = ("Success with noisy input", "strength of the noise", "% of motions")
-    line_plot(series, *about, paths["plot"], zero=True)
-    return paths
 
 
 def _row(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig) -> tuple[float, ...]:

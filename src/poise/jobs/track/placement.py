@@ -25,9 +25,11 @@ from poise.jobs.tracker import Tracker
 from poise.kinematics import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
 from poise.kinematics.feet import Levelled
 from poise.kinematics.fit import ClipFit
+from poise.kinematics.forward import Kinematics
 from poise.kinematics.rate import judge_rate
 from poise.kinematics.repair.faults import Fault, read_faults
 from poise.kinematics.retarget.keypoint_goal import KeypointStream, PointBody, StreamConfig
+from poise.metrics import mpjpe_global, mpjpe_root
 from poise.motion import Clip, shifted
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing
@@ -288,3 +290,78 @@ def _seen(points: Keypoints) -> Keypoints:
     kept = np.flatnonzero(~points.missing.all(0))
     names = tuple(points.names[k] for k in kept)
     return points.replaced(names=names, positions=points.positions[:, kept], confidence=None)
+
+
+@dataclass(frozen=True)
+class Clean:
+    """An input with noise, and the character that followed it, beside the motion without noise.
+
+    noise_mm: mean distance of the bodies in the input. off_mm: that of the character, up to where it
+    failed. succeeded: whether the character stayed within 0.5 m of the motion without noise.
+    """
+
+    noise_mm: float
+    off_mm: float
+    succeeded: bool
+
+    def sentence(self) -> str:
+        """The figures in words."""
+        return (
+            f"The score is that against the input with noise, which moved the bodies by "
+            f"{self.noise_mm:.0f} mm on average; the character is {self.off_mm:.0f} mm from the motion "
+            "without noise."
+        )
+
+
+@dataclass(frozen=True)
+class BesideRaw:
+    """mpjpe_mm, mpjpe_global_mm: the character's error beside what came in, up to where it failed; NaN
+    where that is not known. noise: the largest that was taken off."""
+
+    mpjpe_mm: float
+    mpjpe_global_mm: float
+    noise: Fault
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The score card's `raw`."""
+        return {
+            "mpjpe_mm": self.mpjpe_mm,
+            "mpjpe_global_mm": self.mpjpe_global_mm,
+            "noise_mm": self.noise.size,
+            "noise_hz": math.nan if self.noise.hz is None else self.noise.hz,
+        }
+
+    def sentence(self) -> str:
+        """The motion that the score is against, in words."""
+        beside = ""
+        if math.isfinite(self.mpjpe_mm):
+            beside = f"; the character is {self.mpjpe_mm:.0f} mm from the motion with it"
+        return f"The score is that against the motion without its tremble{beside}."
+
+
+def beside_raw(
+    tracker: Tracker, motion: Clip | Keypoints, placed: PlacedMotion, sim: Tensor, judged: Tensor
+) -> BesideRaw | None:
+    """The character `sim (T, B, 3)` m in the frames `judged (T)`, None where no tremble was taken off.
+
+    motion: what was placed, keypoints where it came as such.
+    """
+    of_clip = [f for f in placed.report.clips[0].clean.noise if f.kind == "tremble"]
+    noise = [*noise_read(placed.source), *of_clip]
+    if not noise:
+        return None
+    worst = max(noise, key=lambda f: f.size)
+    if isinstance(motion, Keypoints):
+        came = fitted(replace(motion, source=replace(motion.source, raw=True)))
+    elif of_clip:
+        came = motion.replaced(skeleton=motion.skeleton.with_source(raw=True))
+    else:
+        # The keypoints that a clip was made of are gone.
+        return BesideRaw(math.nan, math.nan, worst)
+    pos = Kinematics(tracker.humanoid.table)(torch.tensor(place(came, tracker).qpos)).pos.to(sim)
+    # Samples that jump at an end of keypoints may have cut some frames off.
+    frames = min(len(pos), len(sim))
+    here, there, kept = sim[:frames], pos[:frames], judged[:frames]
+    local, whole = (float(of(here, there)[kept].mean()) for of in (mpjpe_root, mpjpe_global))
+    return BesideRaw(local, whole, worst)

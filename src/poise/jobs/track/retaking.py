@@ -15,10 +15,13 @@ from poise.env import Acts, ImitationEnv, Reference
 from poise.env.recovery.clips import mixed
 from poise.errors import PoiseError
 from poise.formats import read_clip
-from poise.jobs.track.controllers import RULE, Show, StepProgress, TrackingRun, episode, look_ahead
-from poise.jobs.track.settings import TrackConfig
-from poise.jobs.track.simulation import Retake, Simulation, States
+from poise.jobs.result import RULE, Result, Way
+from poise.jobs.track.controllers import Show, StepProgress, TrackingRun, episode, look_ahead
+from poise.jobs.track.recovering import ReplayActions
+from poise.jobs.track.simulation import FILE, Retake, Simulation, States
+from poise.jobs.track_settings import TrackConfig
 from poise.jobs.tracker import Tracker
+from poise.kinematics.travel import travelled
 from poise.metrics import has_lost, mpjpe_global, success_rule
 from poise.motion import Clip
 from poise.motion.rotations import slerp
@@ -56,10 +59,11 @@ class Segment(NamedTuple):
 
 
 def retaken(
+    retake: Retake,
     tracker: Tracker,
     imitation: Imitation,
     config: TrackConfig,
-    retake: Retake,
+    _: ReplayActions | None = None,
     show: Show | None = None,
     prices: Tensor | None = None,
 ) -> tuple[TrackingRun, Sequence[str]]:
@@ -321,6 +325,28 @@ def spliced(before: Clip, now: Clip, span: tuple[float, float]) -> Clip:
     return now.replaced(root_pos=root.numpy(), rot=rot.numpy())
 
 
+def as_it_was(retake: Retake) -> Way:
+    """A step of the way home: all that was not simulated anew is as it was written, or would be."""
+
+    def way(result: Result, motion: Clip, hold: bool) -> Clip:
+        before, recordings, travel = retake.opened(), result.evaluation.recordings, result.travel
+        assert result.simulation is not None
+        span = changed_s(before, result.simulation)
+        earlier = None
+        if hold and not isinstance(retake.of, Simulation):
+            earlier = written_as(Path(retake.of), motion)
+            if earlier is not None and travel is not None and not travel.travels:
+                earlier = travelled(earlier, travel.travel)
+        if earlier is None:
+            was = [replace(recordings[0], qpos=before.qpos.numpy())]
+            ways = tuple(w for w in result.ways if w is not way)
+            whole = replace(result.evaluation, recordings=was)
+            earlier = replace(result, evaluation=whole, ways=ways, travel=None).delivered(0, hold)
+        return spliced(earlier, motion, span)
+
+    return way
+
+
 def written_as(folder: Path, like: Clip) -> Clip | None:
     """The motion in a result's folder, as it was written; None where there is none with the skeleton
     and the frames of `like`."""
@@ -333,3 +359,12 @@ def written_as(folder: Path, like: Clip) -> Clip | None:
         return None
     same = clip.skeleton.same_bones(like.skeleton) and clip.frames == like.frames
     return like.replaced(root_pos=np.array(clip.root_pos), rot=np.array(clip.rot)) if same else None
+
+
+def write_simulation(result: Result, out: Path, _motion: Path, _hold: bool) -> dict[str, Path]:
+    """Writes the states of a result into its folder, where it has some."""
+    (out / FILE).unlink(missing_ok=True)
+    if result.simulation is None:
+        return {}
+    result.simulation.save(out / FILE)
+    return {"simulation": out / FILE}

@@ -86,7 +86,7 @@ class Retake:
     """A part of a motion that is simulated anew; the rest stays as it was simulated.
 
     Attributes:
-        of: what was simulated: `Tracked.simulation`, or the folder of a result.
+        of: what was simulated: `Result.simulation`, or the folder of a result.
         first_s, last_s: the part, s.
     """
 

@@ -17,10 +17,10 @@ from poise.errors import PoiseError
 from poise.formats.figure import SceneBox
 from poise.formats.gltf_write import write_gltf
 from poise.formats.text import write_whole
+from poise.jobs.result import Result
 from poise.jobs.track.placement import PlacedMotion
 from poise.kinematics.find_supports import find_supports
 from poise.kinematics.supports import Support
-from poise.motion import Clip
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, CharacterRows, Scene, SceneSim, SimConfig
 from poise.sim.props import Box
@@ -73,9 +73,13 @@ def at_home(supports: Sequence[Support], placed: PlacedMotion) -> tuple[Support,
     return _scaled(lowered, placed, 1.0 / placed.moved.scale if placed.moved else 1.0)
 
 
-def write_supports(supports: Sequence[Support], clip: Clip, out: Path, motion: Path) -> dict[str, Path]:
-    """Writes supports as `supports.json`, which --support reads, and into a GLB with the motion: that of
-    the motion itself where it is one, else `scene.glb`."""
+def write_supports(result: Result, out: Path, motion: Path, hold: bool) -> dict[str, Path]:
+    """Writes what a motion rests on, beside the motion on the skeleton that came in: `supports.json`,
+    which --support reads, and boxes in a GLB with the motion, its own file where that is one, else
+    `scene.glb`."""
+    if not result.supports:
+        return {}
+    supports, clip = at_home(result.supports, result.placed), result.delivered(0, hold)
     scene = motion if motion.suffix.lower() in (".glb", ".gltf") else out / "scene.glb"
     boxes = [SceneBox(f"{s.kind}{k}", s.size, s.pos, s.yaw) for k, s in enumerate(supports, 1)]
     write_gltf(clip, scene, boxes)

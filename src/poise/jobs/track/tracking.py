@@ -2,44 +2,52 @@
 
 tracked = track("kick.bvh")
 tracked.card, tracked.clip, tracked.save("out")
+
+Features change what is tracked and what is made of it, in the order of `FEATURES`; `settings.RULES` say
+which of them are not combined.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
 from poise.env import Reference
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.formats.raw import ReadOptions
+from poise.jobs.deliver import settled as feet_settled
 from poise.jobs.open import Run, open_run
+from poise.jobs.result import RULE, Result, Way, needs_of
 from poise.jobs.runs import Evaluation, scored
-from poise.jobs.track.controllers import RULE, Show, done_by, led_by
-from poise.jobs.track.placement import PlacedMotion, fitted, follow, place, place_all, points_of
-from poise.jobs.track.pushed import with_push
-from poise.jobs.track.rates import InPlace, rate_doubts, rate_notes, with_travel
-from poise.jobs.track.retaking import retaken
-from poise.jobs.track.settings import TrackConfig
-from poise.jobs.track.supports import places, with_supports
-from poise.jobs.track.tracked import (
+from poise.jobs.track.controllers import Show, TrackingRun, done_by, led_by
+from poise.jobs.track.in_place import InPlace, with_travel
+from poise.jobs.track.placement import (
     Clean,
-    Span,
-    Tracked,
+    PlacedMotion,
     beside_raw,
-    cut,
-    needs_of,
-    parts_of,
-    with_parts,
+    fitted,
+    follow,
+    home,
+    place,
+    place_all,
+    points_of,
 )
+from poise.jobs.track.pushed import with_push
+from poise.jobs.track.rates import rate_doubts, rate_notes
+from poise.jobs.track.recovering import RecoveryRun, cut, parts_of, with_parts
+from poise.jobs.track.retaking import as_it_was, retaken, write_simulation
+from poise.jobs.track.supports import places, with_supports, write_supports
+from poise.jobs.track_settings import TrackConfig
 from poise.jobs.tracker import Tracker
+from poise.kinematics.directed import Pin, pinned
 from poise.kinematics.fit import widen
 from poise.kinematics.rate import settled
 from poise.kinematics.supports import Support
@@ -55,6 +63,8 @@ from poise.settings import changed
 GOAL_YIELDS = (
     "The score, and the ghost in the report, are those of the goal, which gives way to the push."
 )
+#: What lies beside the motion of a character that tracked it.
+BESIDE = (write_simulation, write_supports)
 #: What is tracked.
 Motion = Clip | Keypoints | str | Path
 
@@ -67,7 +77,7 @@ def track(
     progress: Show | None = None,
     warn: Callable[[str], None] | None = None,
     **settings: Any,
-) -> Tracked:
+) -> Result:
     """Lets a trained policy do a motion that it need not know, without help and without training.
 
     The motion is tracked from its first frame to its last. Keypoints reach a policy with goals of
@@ -76,7 +86,7 @@ def track(
     Args:
         clip: a clip, keypoints, or a file; keypoints in a file stay keypoints. Several of them are done
             one after another by one character, each where it stands: between them it walks, turns and
-            gets up to the next one's first frame (`Tracked.parts`).
+            gets up to the next one's first frame (`Result.parts`).
         policy: a policy file, the folder of a run of poise train perpetual, or one that is open; by
             default the policy that comes with Poise.
         config: how it is tracked; `settings` are those that differ, such as recover=True, count=4 or
@@ -91,113 +101,308 @@ def track(
             policy.
     """
     config = changed(config or TrackConfig(), settings)
-    if isinstance(policy, Tracker):
-        tracker = policy
-    else:
-        tracker = (policy if isinstance(policy, Run) else open_run(policy)).tracker
+    if not isinstance(policy, Tracker):
+        policy = (policy if isinstance(policy, Run) else open_run(policy)).tracker
+    motions = _motions(clip)
+    config.check(len(motions))
+    session = TrackSession(policy, config, [read_motion(m) for m in motions], progress, warn)
+    features = [feature for feature in FEATURES if feature.asked(session)]
+    for feature in features:
+        feature.prepare(session)
+    result = session.run()
+    for feature in features:
+        result = feature.finish(session, result)
+    return result
+
+
+def _motions(clip: Motion | Sequence[Motion]) -> list[Motion]:
     if not isinstance(clip, Motion | Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise PoiseError(
             f"a motion is a clip, keypoints, a file or several of them, got {clip!r}", code="wrong-type"
         )
-    motions = [clip] if isinstance(clip, Motion) else list(clip)
-    config.check(len(motions))
-    motions = [read_motion(m) for m in motions]
-    several = len(motions) > 1
-    travels = [_with_travel(m, config, several) for m in motions]
-    motions = [m if t is None else t.clip for m, t in zip(motions, travels, strict=True)]
-    motion, travel = motions[0], travels[0]
-    given, points = _input(motion, config)
-    if travel is not None:
-        config = replace(config, direction=travel.moved(config.direction))
-    config.direction.check(given, tracker.humanoid.table)
-    undirected, (given, directions) = given, config.direction.applied(given)
-    if config.recover or several:
-        all_placed = place_all([given, *(_input(m, config)[0] for m in motions[1:])], tracker)
-    else:
-        tracker = tracker.with_bones_of(given) if config.body == "own" else tracker
-        all_placed = [place(given, tracker)]
-    placed = all_placed[0]
-    imitation = imitation_of(tracker, all_placed)
-    notes = [f"{p.clip.name}: {n}" if several else n for p in all_placed for n in p.notes]
-    notes += directions
-    doubts = [*(t.sentence() for t in travels if t is not None), *rate_doubts(all_placed)]
-    if warn is not None:
-        for doubt in doubts:
-            warn(doubt)
-    notes += doubts
-    if points is not None and not several:
-        reference, said = follow(tracker, placed, points, imitation.reference, config.smooth_hz)
-        imitation, notes = replace(imitation, reference=reference), [*notes, *said]
-    goals = imitation.reference.pose.pos
+    return [clip] if isinstance(clip, Motion) else list(clip)
+
+
+@dataclass(eq=False)
+class TrackSession:
+    """A motion on its way from what came in to the result, which features change.
+
+    Attributes:
+        tracker, config: the policy, and how it tracks.
+        motions: what came in, in place with its travel.
+        show, warn: see `track`.
+        given, points: the same as clips, and the first one as keypoints where it is.
+        clean: the first motion as it came, before noise.
+        travel: what was done to a clip in place.
+        undirected: the motion before a director's wishes.
+        placed, imitation: the motions on the body, and as a task.
+        goals: `(T, B, 3)` m, where the bodies are to be, before anything pushes or leads.
+        supports: what the motion rests on.
+        led, apart: a character that was led along its motions, and the motions each for itself.
+        do: how the task is done; by default `done_by`.
+        done: how it was done.
+    """
+
+    tracker: Tracker
+    config: TrackConfig
+    motions: list[Clip | Keypoints]
+    show: Show | None = None
+    warn: Callable[[str], None] | None = None
+    given: list[Clip] = field(init=False)
+    points: Keypoints | None = None
+    travel: InPlace | None = None
+    undirected: Clip | None = None
+    placed: list[PlacedMotion] = field(init=False)
+    imitation: Imitation = field(init=False)
+    goals: torch.Tensor = field(init=False)
     supports: tuple[Support, ...] = ()
-    if not several and not config.recover and config.count == 1:
-        supports, imitation = with_supports(imitation, config.supports, placed)
-        notes += [s.sentence() for s in supports]
-    imitation = with_push(imitation, config.push)
-    if config.count > 1:
-        imitation = side_by_side(imitation, config.count)
-    losses, replayed, apart, spans = None, None, imitation.reference, list[Span]()
-    if config.recover or several:
-        led, said = led_by(tracker, all_placed, imitation, config, progress)
-        placed, imitation, replayed, losses, spans = led
-        notes += said
-    ref = imitation.reference
-    prices = config.direction.prices(given, imitation.humanoid.table, ref.frames, ref.rate_hz)
-    if config.retake is None:
-        done, said = done_by(tracker, imitation, config, replayed, progress, prices)
-    else:
-        done, said = retaken(tracker, imitation, config, config.retake, progress, prices)
-    notes += said
-    if done.pushed is not None:
-        assert config.push is not None
-        notes += [done.pushed.sentence(), *config.push.yields.notes, GOAL_YIELDS]
-    elif not several and config.retake is None:
-        said = rate_notes(
-            tracker, given, placed.report.clips[0].rate,
-            lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
-        )  # fmt: skip
-        notes, doubts = [*notes, *said], [*doubts, *said]
-    rollouts, frames = done.rollouts, done.failures
-    about, rate = tracker.about, imitation.reference.rate_hz
-    suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
-    scores = cut(rollouts, spans, apart) if several else rollouts
-    card = scored(scores, imitation, about, RULE, tracker.config.method + suffix)
-    parts = tuple(parts_of(scores, spans, RULE, config.recover)) if several else ()
-    if several:
-        card = with_parts(card, parts)
-    else:
-        card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation, supports)))
-        seen = done.judged.mask[0]
-        beside = rollouts.pos[0][seen], rollouts.ref_pos[0][seen], imitation.reference.rate_hz
-        far = [c.told(imitation.humanoid.bodies) for c in deviations(*beside)]
-        card = replace(card, detail=detail(*beside), changed=tuple(far))
-        raw = beside_raw(tracker, points or given, placed, rollouts.pos[0], done.judged.mask[0])
-        if raw is not None:
-            card = replace(card, raw=raw.figures)
-            notes.append(raw.sentence())
-    clean = None
-    if config.noise:
-        seen = rollouts.pos[0], goals
-        clean = _beside_clean(tracker, motion, done.judged.mask[0], *seen, config)
-        notes.append(clean.sentence())
-    if float(about.get("help_n", 0.0)) > 0:
-        notes.append(
-            f"The policy is that of an unfinished training that still helped by up to "
-            f"{float(about['help_n']):.0f} N; here nothing helps."
+    led: RecoveryRun | None = None
+    apart: Reference = field(init=False)
+    do: Callable[..., tuple[TrackingRun, Sequence[str]]] | None = None
+    done: TrackingRun = field(init=False)
+    notes: list[str] = field(default_factory=list[str])
+    doubts: list[str] = field(default_factory=list[str])
+
+    @property
+    def several(self) -> bool:
+        """Whether motions are done one after another."""
+        return len(self.motions) > 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether recovery motions lead the character to its motions."""
+        return self.several or self.config.recover
+
+    def run(self) -> Result:
+        """Simulates and scores."""
+        tracker, config, imitation, led = self.tracker, self.config, self.imitation, self.led
+        ref, hold = imitation.reference, led.replayed if led else None
+        prices = config.direction.prices(
+            self.given[0], imitation.humanoid.table, ref.frames, ref.rate_hz
         )
-    evaluation = Evaluation(card, rollouts, done.recordings, config.count > 1)
-    times = tuple((character, frame / rate) for character, frame in frames)
-    if losses is not None:
-        times = tuple((0, t) for t in losses.lost)
-    elif several:
-        times = tuple((0, p.lost) for p in parts if p.lost is not None)
-    return Tracked(
-        tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
-        done.controller, parts, supports, config.direction.pins,
-        None if several or config.recover else done.simulation, done.pushed,
-        undirected if config.direction else None, config.retake, tuple(doubts),
-        None if several else travel,
-    )  # fmt: skip
+        do = self.do or done_by
+        self.done, said = do(tracker, imitation, config, hold, self.show, prices)
+        notes, about, done = [*self.notes, *said], tracker.about, self.done
+        suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
+        rollouts = done.rollouts
+        scores = cut(rollouts, led.spans, self.apart) if led and self.several else rollouts
+        card = scored(scores, imitation, about, RULE, tracker.config.method + suffix)
+        if float(about.get("help_n", 0.0)) > 0:
+            notes.append(
+                f"The policy is that of an unfinished training that still helped by up to "
+                f"{float(about['help_n']):.0f} N; here nothing helps."
+            )
+        return Result(
+            imitation,
+            Evaluation(card, rollouts, done.recordings, config.count > 1),
+            tracker,
+            led.placed if led else self.placed[0],
+            tuple(notes),
+            tuple(self.doubts),
+            tuple((character, frame / ref.rate_hz) for character, frame in done.failures),
+            done.controller,
+            found=done.found,
+            simulation=None if self.leads else done.simulation,
+            ways=(brought_home(config.direction.pins),),
+            beside=BESIDE,
+        )
+
+
+def _nothing(session: TrackSession) -> None: ...
+
+
+def _same(session: TrackSession, result: Result) -> Result:
+    return result
+
+
+@dataclass(frozen=True)
+class Feature:
+    """What may be done to a motion beside tracking it.
+
+    Attributes:
+        asked: whether a session asks for it.
+        prepare: changes the session before anything is simulated.
+        finish: the result with what the feature found.
+    """
+
+    asked: Callable[[TrackSession], bool]
+    prepare: Callable[[TrackSession], None] = _nothing
+    finish: Callable[[TrackSession, Result], Result] = _same
+
+
+def _travel(s: TrackSession) -> None:
+    """Motions in place get their travel; a director's wishes are where that is."""
+    made = [_with_travel(m, s.config, s.several) for m in s.motions]
+    s.motions = [m if t is None else t.clip for m, t in zip(s.motions, made, strict=True)]
+    s.doubts += [t.sentence() for t in made if t is not None]
+    s.travel = None if s.several else made[0]
+    if s.travel is not None:
+        s.config = replace(s.config, direction=s.travel.moved(s.config.direction))
+
+
+def _read_input(s: TrackSession) -> None:
+    """The motions as clips, with noise."""
+    read = [_input(m, s.config) for m in s.motions]
+    s.given, s.points = [clip for clip, _ in read], read[0][1]
+
+
+def _direct(s: TrackSession) -> None:
+    """The motion as a director wants it."""
+    s.config.direction.check(s.given[0], s.tracker.humanoid.table)
+    s.undirected = s.given[0]
+    s.given[0], said = s.config.direction.applied(s.given[0])
+    s.notes += said
+
+
+def _place(s: TrackSession) -> None:
+    """The motions on the body, as a task."""
+    if s.leads:
+        s.placed = place_all(s.given, s.tracker)
+    else:
+        s.tracker = s.tracker.with_bones_of(s.given[0]) if s.config.body == "own" else s.tracker
+        s.placed = [place(s.given[0], s.tracker)]
+    s.imitation = imitation_of(s.tracker, s.placed)
+    s.notes += [f"{p.clip.name}: {n}" if s.several else n for p in s.placed for n in p.notes]
+    s.doubts += rate_doubts(s.placed)
+    if s.warn is not None:
+        for doubt in s.doubts:
+            s.warn(doubt)
+    s.notes += s.doubts
+    if s.points is not None and not s.several:
+        ref = s.imitation.reference
+        ref, said = follow(s.tracker, s.placed[0], s.points, ref, s.config.smooth_hz)
+        s.imitation = replace(s.imitation, reference=ref)
+        s.notes += said
+    s.apart = s.imitation.reference
+    s.goals = s.apart.pose.pos
+
+
+def _support(s: TrackSession) -> None:
+    """What a single motion rests on."""
+    s.supports, s.imitation = with_supports(s.imitation, s.config.supports, s.placed[0])
+    s.notes += [one.sentence() for one in s.supports]
+
+
+def _push(s: TrackSession) -> None:
+    s.imitation = with_push(s.imitation, s.config.push)
+
+
+def _pushed(s: TrackSession, result: Result) -> Result:
+    push, came = s.config.push, s.done.pushed
+    assert push is not None and came is not None
+    notes = (*result.notes, came.sentence(), *push.yields.notes, GOAL_YIELDS)
+    return replace(result, notes=notes, pushed=came)
+
+
+def _crowd(s: TrackSession) -> None:
+    s.imitation = side_by_side(s.imitation, s.config.count)
+
+
+def _lead(s: TrackSession) -> None:
+    """Recovery motions between motions, and wherever one is lost, are a part of what is tracked."""
+    s.led, said = led_by(s.tracker, s.placed, s.imitation, s.config, s.show)
+    s.imitation = s.led.imitation
+    s.notes += said
+
+
+def _led(s: TrackSession, result: Result) -> Result:
+    led = s.led
+    assert led is not None
+    lost = led.losses.lost if led.losses else None
+    if not s.several:
+        failures = result.failures if lost is None else tuple((0, t) for t in lost)
+        return replace(result, losses=led.losses, failures=failures)
+    scores = cut(s.done.rollouts, led.spans, s.apart)
+    parts = tuple(parts_of(scores, led.spans, RULE, s.config.recover))
+    evaluation = replace(result.evaluation, card=with_parts(result.evaluation.card, parts))
+    lost = [p.lost for p in parts if p.lost is not None] if lost is None else lost
+    failures = tuple((0, t) for t in lost)
+    return replace(result, evaluation=evaluation, losses=led.losses, failures=failures, parts=parts)
+
+
+def _retake(s: TrackSession) -> None:
+    assert s.config.retake is not None
+    s.do = partial(retaken, s.config.retake)
+
+
+def _retaken(s: TrackSession, result: Result) -> Result:
+    assert s.config.retake is not None
+    return replace(result, ways=(*result.ways, as_it_was(s.config.retake)))
+
+
+def _tried_rates(s: TrackSession, result: Result) -> Result:
+    """Sentences on the frame rate at which a lost motion is done."""
+    judged, lost = s.placed[0].report.clips[0].rate, bool(s.done.failures)
+
+    def on_body(clip: Clip) -> Imitation:
+        return imitation_of(s.tracker, [place(clip, s.tracker)])
+
+    said = rate_notes(s.tracker, s.given[0], judged, on_body, s.config, lost, s.show)
+    return replace(result, notes=(*result.notes, *said), doubts=(*result.doubts, *said))
+
+
+def _compared(s: TrackSession, result: Result) -> Result:
+    """The score of a single motion with what it needs, and where the character is far from it."""
+    imitation, seen, notes = result.imitation, s.done.judged.mask[0], result.notes
+    rollouts, rate = result.evaluation.rollouts, imitation.reference.rate_hz
+    near = rollouts.pos[0][seen], rollouts.ref_pos[0][seen], rate
+    far = [c.told(imitation.humanoid.bodies) for c in deviations(*near)]
+    needs = tuple(n.to_dict() for n in needs_of(imitation, s.supports))
+    card = replace(result.evaluation.card, needs=needs, detail=detail(*near), changed=tuple(far))
+    raw = beside_raw(result.tracker, s.points or s.given[0], result.placed, rollouts.pos[0], seen)
+    if raw is not None:
+        card, notes = replace(card, raw=raw.figures), (*notes, raw.sentence())
+    more: dict[str, Any] = {"supports": s.supports, "undirected": s.undirected, "travel": s.travel}
+    return replace(result, evaluation=replace(result.evaluation, card=card), notes=notes, **more)
+
+
+def _without_noise(s: TrackSession, result: Result) -> Result:
+    """The character beside the motion without noise."""
+    clean, _ = _input(s.motions[0], replace(s.config, noise=()))
+    pos = imitation_of(s.tracker, [place(clean, s.tracker)]).reference.pose.pos
+    sim, noisy = result.evaluation.rollouts.pos[0], s.goals
+    # A gap at an end of noisy keypoints may have cut some frames off.
+    frames = min(len(pos), len(sim), len(noisy))
+    pos, sim, noisy, kept = pos[:frames], sim[:frames], noisy[:frames], s.done.judged.mask[0][:frames]
+    off = mpjpe_global(sim, pos)
+    won = not bool(has_lost(sim, pos).any())
+    came = Clean(float(mpjpe_global(noisy, pos).mean()), float(off[kept].mean()), won)
+    return replace(result, clean=came, notes=(*result.notes, came.sentence()))
+
+
+#: What is done to a motion, in this order.
+FEATURES = (
+    Feature(lambda _: True, _travel),
+    Feature(lambda _: True, _read_input),
+    Feature(lambda s: bool(s.config.direction), _direct),
+    Feature(lambda _: True, _place),
+    Feature(lambda s: not s.leads and s.config.count == 1, _support),
+    Feature(lambda s: s.config.push is not None, _push, _pushed),
+    Feature(lambda s: s.config.count > 1, _crowd),
+    Feature(lambda s: s.leads, _lead, _led),
+    Feature(lambda s: s.config.retake is not None, _retake, _retaken),
+    Feature(
+        lambda s: not s.several and s.config.push is None and s.config.retake is None,
+        finish=_tried_rates,
+    ),
+    Feature(lambda s: not s.several, finish=_compared),
+    Feature(lambda s: bool(s.config.noise), finish=_without_noise),
+)
+
+
+def brought_home(pins: Sequence[Pin] = ()) -> Way:
+    """How a motion of a placed motion's body comes onto the skeleton that came in: limbs that stay put
+    are led there, and feet that still slide are held, see `settled`."""
+
+    def way(result: Result, motion: Clip, hold: bool) -> Clip:
+        placed = result.placed
+        if placed.moved is not None:
+            motion = home(motion, placed, result.tracker).replaced(name=motion.name)
+        if not hold:
+            return motion
+        return pinned(motion, pins) if pins else feet_settled(motion, placed.calm)
+
+    return way
 
 
 def imitation_of(tracker: Tracker, placed: Sequence[PlacedMotion]) -> Imitation:
@@ -278,18 +483,3 @@ def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoin
         points = perturb_points(motion, config.noise, config.seed) if config.noise else motion
         return fitted(points, config.smooth_hz), points
     return (perturb_clip(motion, config.noise, config.seed) if config.noise else motion), None
-
-
-def _beside_clean(
-    tracker: Tracker, motion: Clip | Keypoints, judged: Tensor, sim: Tensor, noisy: Tensor,
-    config: TrackConfig,
-) -> Clean:  # fmt: skip
-    """The character `sim (T, B, 3)` beside the motion without noise, in the frames `judged (T)`."""
-    clean, _ = _input(motion, replace(config, noise=()))
-    pos = imitation_of(tracker, [place(clean, tracker)]).reference.pose.pos
-    # A gap at an end of noisy keypoints may have cut some frames off.
-    frames = min(len(pos), len(sim), len(noisy))
-    pos, sim, noisy, kept = pos[:frames], sim[:frames], noisy[:frames], judged[:frames]
-    off = mpjpe_global(sim, pos)
-    won = not bool(has_lost(sim, pos).any())
-    return Clean(float(mpjpe_global(noisy, pos).mean()), float(off[kept].mean()), won)

@@ -33,12 +33,14 @@ from poise.motion.rotations import (
 from poise.motion.skeleton import posed
 from poise.motion.smoothing import (
     LINES,
+    NOTHING_MM,
     SHORTEST,
     WHITE_MM,
     Spectrum,
     faded,
     filled,
     find_runs,
+    only_noise,
     pieces,
     smoothed,
     tremble_of,
@@ -60,8 +62,9 @@ MANY_SPIKES, SMALL_TIMES, SMALL_RAD, SPIKE_ROUNDS = 1e-3, 5.0, 0.02, 3
 FEW_RAD = 0.1
 #: A tremble is looked for in what is faster than this (Hz), of axes that turn by more than this (rad).
 SLOW_HZ, STILL_RAD = 0.7, 1e-5
-#: White noise (mm) that leaves nothing of a motion.
-NOTHING_MM = 300.0
+#: Turns (rad) of the middle joint from each frame to the next that leave nothing of a motion: random
+#: ones are 2.2 on average.
+NOTHING_RAD = 1.3
 #: Cycles are the same where they are apart by less than this share of their energy.
 REPEATED = 1e-4
 
@@ -98,13 +101,7 @@ def denoise(clip: Clip) -> Clip:
     out_root, out_rot, changed = root.copy(), rot.copy(), False
     for here in pieces(clip.frames, clip.fps):
         if (white := white_mm(positions[here], clip.fps)) > NOTHING_MM:
-            raise PoiseError(
-                f"frames {here.start} to {here.stop - 1} jump about by {white / 1e3:.2g} m each: there "
-                "is no motion to be told",
-                clip.name,
-                "Cut them off; --raw takes the file as it is",
-                code="only-noise",
-            )
+            raise only_noise(clip.name, here, f"{white / 1e3:.2g} m")
         found = _piece(clip, root[here], rot[here], world[here], positions[here])
         if found is None:
             continue
@@ -120,6 +117,15 @@ def denoise(clip: Clip) -> Clip:
     return clip.replaced(root_pos=out_root, rot=unwrap_quats(torch.tensor(out_rot)).numpy())
 
 
+def _turn(rot: np.ndarray) -> float:
+    """How far (rad) joints turn from one frame to the next: the mean over frames of the middle joint, of
+    those that turn."""
+    if len(rot) < SHORTEST:
+        return 0.0
+    step = quat_distance(torch.tensor(rot[1:]), torch.tensor(rot[:-1])).numpy().mean(0)
+    return float(np.median(step[step > STILL_RAD])) if (step > STILL_RAD).any() else 0.0
+
+
 def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     """The faults that noise is, and the clip with its lost joints filled in.
 
@@ -129,6 +135,9 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     if clip.frames < SHORTEST:
         return [], clip
     rot = _continuous(clip.rot)
+    for here in pieces(clip.frames, clip.fps):
+        if (turn := _turn(rot[here])) > NOTHING_RAD:
+            raise only_noise(clip.name, here, f"{np.degrees(turn):.0f} degrees")
     # Trembling keypoints lost their spikes as points. Bones that were fitted to them turn about each
     # other, and one alone that is filled in would move what it carries.
     fitted = any(kind == "tremble" for kind, *_ in clip.skeleton.source.mended)

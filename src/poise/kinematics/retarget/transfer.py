@@ -83,10 +83,9 @@ def retarget(
     began = time.perf_counter()
     config = config or RetargetConfig()
     target = onto if isinstance(onto, Skeleton) else onto.skeleton
-    world, passage = ClipWorld.of(clip), Retargeter.between(clip, onto, mapping, example, config.scale)
-    if config.rigid:
-        passage = replace(passage, joints=passage.joints.without(config.rigid))
-    rot, root = passage.transfer(world, config.share)
+    how = config.scale, config.share, config.rigid
+    world, passage = ClipWorld.of(clip), Retargeter.between(clip, onto, mapping, example, *how)
+    rot, root = passage.transfer(world)
     feet = feet_of(passage)
     contacts = source_contacts(clip, world, feet, passage.scale.ground)
     if config.contacts or config.clear:

@@ -5,62 +5,29 @@ from __future__ import annotations
 import asyncio
 import http
 import json
-import struct
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
 
-import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from poise.errors import PoiseError
-from poise.live.commands import MOST_BYTES, VERSION, command, parse
+from poise.live.protocol import MOST_BYTES, VERSION, command, parse
 from poise.live.sockets import WAITING, Bucket, Guard, GuardedSocket, pauses
-from poise.live.sources import Fits, JsonStream
+from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
-
-#: Version, step, simulated time, characters, bodies; then what each does, and numbers.
-HEAD = struct.Struct("<IIdHH")
-
-
-def packed(
-    step: int,
-    time_s: float,
-    doing: Sequence[int],
-    bodies: np.ndarray,
-    goals: np.ndarray,
-    ball: np.ndarray,
-) -> bytes:
-    """Little-endian: version u32, step u32, time f64, K u16, B u16; K u8 what each character does,
-    filled up to a multiple of 4; f32 `(K, B, 7)` of the bodies, as many of the goals, 7 of the ball."""
-    k, b = bodies.shape[:2]
-    head = HEAD.pack(VERSION, step, time_s, k, b) + bytes(doing) + bytes(-k % 4)
-    return head + b"".join(np.ascontiguousarray(x, "<f4").tobytes() for x in (bodies, goals, ball))
-
-
-def as_json(time_s: float, doing: Sequence[str], bodies: np.ndarray) -> str:
-    """The same for programs: places m and rotations wxyz of the simulated bodies."""
-    characters = [
-        {
-            "doing": what,
-            "pos": np.round(rows[:, :3].astype(float), 5).tolist(),
-            "quat": np.round(rows[:, 3:].astype(float), 5).tolist(),
-        }
-        for what, rows in zip(doing, bodies, strict=True)
-    ]
-    return json.dumps({"v": VERSION, "type": "bodies", "time": time_s, "characters": characters})
-
 
 #: What can be fetched: a fixed list, so that no path leads to a file of the user's.
 PAGES = {
     "/": ("live.page", "live.html", "text/html; charset=utf-8"),
     "/live.js": ("live.page", "live.js", "text/javascript; charset=utf-8"),
-    "/stage.js": ("live.page", "stage.js", "text/javascript; charset=utf-8"),
+    "/stage.js": ("score.report", "stage.js", "text/javascript; charset=utf-8"),
+    "/characters.js": ("live.page", "characters.js", "text/javascript; charset=utf-8"),
     "/live.css": ("live.page", "live.css", "text/css; charset=utf-8"),
     "/three.js": ("score.report", "three.min.js", "text/javascript; charset=utf-8"),
 }
@@ -102,7 +69,7 @@ class PageServer:
         command: takes a checked command.
         figures: what is shown beside the characters, asked for a few times a second.
         clock: s, by which packets arrive.
-        points: fits keypoints of streams; None takes none.
+        points: takes keypoints of streams; None takes none.
 
     Raises:
         PoiseError: the address is taken or is none of this machine.
@@ -116,7 +83,7 @@ class PageServer:
         command: Callable[[dict[str, Any]], None],
         figures: Callable[[], dict[str, Any]],
         clock: Callable[[], float],
-        points: Fits | None = None,
+        points: Takes | None = None,
     ):
         self._points = points
         self.guard, self.inbox, self.clock = guard, inbox, clock

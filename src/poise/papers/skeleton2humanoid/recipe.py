@@ -5,14 +5,14 @@ humanoid, stage III lets a policy imitate it with a residual force that becomes 
 
 | paper                                        | here                                               |
 |----------------------------------------------|----------------------------------------------------|
-| Sec. 3.1 in-betweening (Harvey et al.)       | `jobs.inbetween`, `learn.rtn`, `learn.between`       |
-| Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.inbetween`                                      |
-| Sec. 3.3, App. A analytic IK                 | `kin.ik`, for motion that is joints alone; `build` |
+| Sec. 3.1 in-betweening (Harvey et al.)       | `jobs.inbetween`, `rtn`, `learn.between`           |
+| Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.inbetween_model`                            |
+| Sec. 3.3, App. A analytic IK                 | `kinematics.ik`, for joints alone; `build`         |
 |                                              | takes a clip's own angles and sets it on the floor |
-| Sec. 3.4.1 state with the next two frames    | `env.observations`, `observation="next two"`  |
+| Sec. 3.4.1 state with the next two frames    | `env.observations`, `observation="next two"`       |
 | Sec. 3.4.1 action (u_t, eta_t), Eq. 8        | `control.PDTargets`, `control.ImplicitResidual`    |
 | Sec. 3.4.2 curriculum, Eq. 9                 | `control.LinearHelp`                               |
-| App. B an episode ends 0.5 m too low         | `env.rewards.root_below`                        |
+| App. B an episode ends 0.5 m too low         | `env.rewards.root_below`                           |
 | baseline UHC (Luo et al. 2021), in-house     | `uhc`                                              |
 
 A policy of stage III is trained on the very motions that it corrects, one policy for each length of

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from poise.score.report.data import number
+from poise.score.thresholds import THRESHOLDS
 
 LEVELS = ("good", "fair", "poor")
 
@@ -31,18 +32,14 @@ class Grade:
     counts: bool = True
 
 
-def _level(value: float | None, key: str, larger: bool = False) -> str:
-    if value is None:
-        return "unknown"
-    good, fair = THRESHOLDS[key]
-    if larger:
-        return "good" if value >= good else "fair" if value >= fair else "poor"
-    return "good" if value <= good else "fair" if value <= fair else "poor"
+def _level(value: float | None, key: str) -> str:
+    return "unknown" if value is None else THRESHOLDS[key].verdict(value)
 
 
-def _rule(key: str, unit: str, times: float = 1.0, word: str = "to") -> str:
-    good, fair = (f"{bound * times:g}" for bound in THRESHOLDS[key])
-    return f"good {word} {good}, fair {word} {fair} {unit}"
+def _rule(key: str, unit: str, times: float = 1.0) -> str:
+    t = THRESHOLDS[key]
+    word = "from" if t.more else "to"
+    return f"good {word} {t.good * times:g}, fair {word} {t.fair * times:g} {unit}"
 
 
 def percent(share: float) -> str:
@@ -60,16 +57,6 @@ def _part(score: dict[str, Any], name: str) -> dict[str, Any]:
     return part if isinstance(part, dict) else {}
 
 
-THRESHOLDS: dict[str, tuple[float, float]] = {
-    "succ": (0.95, 0.80),
-    "mpjpe_mm": (40.0, 80.0),
-    "foot_slide_mm_per_s": (100.0, 250.0),
-    "share_of_body_weight": (0.02, 0.10),
-    "torque_mean_nm": (5.0, 25.0),
-}
-"""(good, fair) bounds; the score card's own (`score.card`) are the same, and a test says so."""
-
-
 def tracking(score: dict[str, Any]) -> Grade:
     """How often the whole clip is tracked to its end, upright and on its feet where measured."""
     succ, tracked = number(score.get("succ")), number(score.get("tracked"))
@@ -77,12 +64,12 @@ def tracking(score: dict[str, Any]) -> Grade:
     if succ is not None and tracked is not None and tracked < succ:
         detail = f"{percent(succ)} by {detail}, but down or off its feet"
         succ = tracked
-    rule = _rule("succ", "%", 100, "from")
+    rule = _rule("succ", "%", 100)
     if succ is None:
         return Grade("Tracks the whole clip", "not measured", "unknown", rule)
     word = "yes" if succ >= 1 - 1e-9 else "almost" if succ >= 0.95 else "no"
     return Grade(
-        "Tracks the whole clip", f"{word} ({percent(succ)})", _level(succ, "succ", True), rule, detail
+        "Tracks the whole clip", f"{word} ({percent(succ)})", _level(succ, "succ"), rule, detail
     )
 
 

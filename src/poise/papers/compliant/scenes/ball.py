@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -23,9 +24,9 @@ from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
 from poise.papers.compliant.scenes.stage import Given, SceneSetup
-from poise.settings import Range, validate
+from poise.settings import Checked, Positive, Range, validate
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
-from poise.sim.props import Rod
+from poise.sim.props import Vector, solid
 
 #: Sharpness of the reward, 1/m^2 (Sec. 5.4).
 SHARPNESS = 2.0
@@ -40,6 +41,39 @@ GAIN, DAMPING = 700.0, 250.0
 #: Of the angle at which a rod counts as fallen.
 COS_45 = math.cos(math.pi / 4)
 FLAT = torch.tensor([1.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Rod(Checked):
+    """A free rod that stands on its lower end and carries a ball on the upper one; one body, with the
+    lower end as its origin. Nothing touches it, so that what it stands on must be a link.
+
+    Attributes:
+        name: how the scene calls it.
+        length: m, from the lower end to the ball's centre.
+        radius: m, of the ball.
+        mass: kg, of the ball; the rod has a tenth of it.
+        pos: m, its lower end at first.
+    """
+
+    name: str = "rod"
+    length: Positive = 1.0
+    radius: Positive = 0.08
+    mass: Positive = 0.5
+    pos: Vector = (0.0, 0.0, 0.0)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
+        body.add_freejoint(name=self.name)
+        rod, ball = [0.0, 0.0, self.length / 2], [0.0, 0.0, self.length]
+        thin = [0.015, self.length / 2]
+        geoms = (
+            solid(body, f"{self.name}/rod", "capsule", thin, pos=rod, mass=0.1 * self.mass),
+            solid(body, f"{self.name}/ball", "sphere", [self.radius], pos=ball, mass=self.mass),
+        )
+        for geom in geoms:
+            geom.contype = geom.conaffinity = 0
 
 
 @dataclass(frozen=True)

@@ -1,64 +1,12 @@
-// The replay in WebGL, with three.js. Same four functions as the canvas stage: draw, project, resize, theme.
+// The replay on the stage. Same four functions as the canvas stage: draw, project, resize, theme.
 Poise.stageGL = (host, data, extent) => {
-  const T = THREE;
-  const canvas = document.createElement("canvas");
-  const renderer = new T.WebGLRenderer({ canvas, antialias: true, alpha: false });
-  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-  renderer.shadowMap.enabled = true;
-  host.prepend(canvas);
-  const scene = new T.Scene();
-  const camera = new T.PerspectiveCamera(26, 1, 0.05, 200);
-  camera.up.set(0, 0, 1);
-  const controls = new T.OrbitControls(camera, canvas);
-  controls.enableDamping = true;
-  controls.dampingFactor = 0.12;
-  controls.maxPolarAngle = 1.56;
-  controls.minDistance = 1;
-  controls.maxDistance = 30;
-
-  const sky = new T.HemisphereLight(0xffffff, 0xa39d98, 2.3);
-  sky.position.set(0, 0, 1);
-  const sun = new T.DirectionalLight(0xffffff, 2.1);
-  sun.castShadow = true;
-  sun.shadow.mapSize.set(2048, 2048);
-  sun.shadow.radius = 5;
-  sun.shadow.bias = -0.0004;
-  sun.shadow.normalBias = 0.02;
-  const reach = 2.2 + extent.gap;
-  Object.assign(sun.shadow.camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: 1, far: 20 });
-  scene.add(sky, sun, sun.target);
-
-  const grid = new T.ShaderMaterial({
-    transparent: true,
-    depthWrite: false,
-    uniforms: { center: { value: new T.Vector3() }, ink: { value: new T.Color() }, strength: { value: 0.3 } },
-    vertexShader: `varying vec3 at; void main() { vec4 w = modelMatrix * vec4(position, 1.0); at = w.xyz;
-      gl_Position = projectionMatrix * viewMatrix * w; }`,
-    fragmentShader: `varying vec3 at; uniform vec3 center; uniform vec3 ink; uniform float strength;
-      float mesh(vec2 p) { vec2 w = fwidth(p); vec2 d = abs(fract(p - 0.5) - 0.5) / max(w, vec2(1e-6));
-        vec2 seen = (1.0 - smoothstep(vec2(0.0), vec2(1.4), d)) * (1.0 - smoothstep(0.08, 0.4, w));
-        return max(seen.x, seen.y); }
-      void main() { float far = 1.0 - smoothstep(1.0, 7.5, distance(at.xy, center.xy));
-        float a = max(mesh(at.xy), 0.35 * mesh(at.xy * 4.0));
-        gl_FragColor = vec4(ink, a * far * strength);
-        #include <colorspace_fragment>
-      }`,
+  const base = threeStage(host, {
+    fov: 26, polar: 1.56, far: 30, reach: 2.2 + extent.gap, depth: 20, fade: [1, 7.5], fog: [14, 40],
+    sunAt: [2.2, -2.8, 6.5], detail: 12,
   });
-  const plane = new T.PlaneGeometry(60, 60);
-  const floor = new T.Mesh(plane, grid);
-  const shade = new T.Mesh(plane, new T.ShadowMaterial({ opacity: 0.22 }));
-  floor.position.z = 0.001;
-  shade.receiveShadow = true;
-  scene.add(shade, floor);
-
-  function geometry(shape) {
-    const [a, b, c] = shape.size;
-    if (shape.kind === "box") return new T.BoxGeometry(2 * a, 2 * b, 2 * c);
-    if (shape.kind === "sphere") return new T.SphereGeometry(a, 28, 20);
-    return new T.CapsuleGeometry(a, 2 * b, 10, 24).rotateX(Math.PI / 2);
-  }
-
-  const solid = () => new T.MeshStandardMaterial({ roughness: 0.62, metalness: 0.0 });
+  const { T, canvas, scene, camera, controls, place, solid } = base;
+  controls.dampingFactor = 0.12;
+  const skin = () => new T.MeshStandardMaterial({ roughness: 0.62, metalness: 0.0 });
   const ghost = new T.ShaderMaterial({
     transparent: true,
     uniforms: { tint: { value: new T.Color() }, rim: { value: new T.Color() } },
@@ -72,53 +20,32 @@ Poise.stageGL = (host, data, extent) => {
       }`,
   });
   const veil = new T.MeshBasicMaterial({ colorWrite: false, transparent: true });
-  const shapes = data.shapes.map((shape) => ({ shape, geo: geometry(shape) }));
   const feet = [0, 1].map((side) => new Set(data.feet[side]));
 
   // The ghost is drawn twice, first into the depth buffer alone, so that its inner parts stay hidden.
+  const ghostly = (shape) => [veil, ghost].map((material, k) => {
+    const mesh = solid(shape, material);
+    mesh.castShadow = material !== veil;
+    mesh.receiveShadow = false;
+    mesh.renderOrder = k + 1;
+    return mesh;
+  });
   function character(isGhost) {
-    const root = new T.Group();
-    const parts = data.bodies.map(() => new T.Group());
-    const mats = [solid(), solid(), solid()];
-    for (const { shape, geo } of shapes) {
-      const side = feet[0].has(shape.body) ? 1 : feet[1].has(shape.body) ? 2 : 0;
-      for (const material of isGhost ? [veil, ghost] : [mats[side]]) {
-        const mesh = new T.Mesh(geo, material);
-        mesh.position.set(...shape.pos);
-        mesh.quaternion.set(shape.quat[1], shape.quat[2], shape.quat[3], shape.quat[0]);
-        mesh.castShadow = material !== veil;
-        mesh.receiveShadow = !isGhost;
-        mesh.renderOrder = material === veil ? 1 : material === ghost ? 2 : 0;
-        parts[shape.body].add(mesh);
-      }
-    }
-    root.add(...parts);
-    scene.add(root);
-    return { root, parts, mats };
+    const mats = [skin(), skin(), skin()];
+    const side = ({ body }) => (feet[0].has(body) ? 1 : feet[1].has(body) ? 2 : 0);
+    const dress = isGhost ? ghostly : (shape) => [solid(shape, mats[side(shape)])];
+    return { ...base.figure(data.bodies, data.shapes, dress), mats };
   }
   // What stands in the world, beside each character where they are apart.
   const wood = new T.MeshStandardMaterial({ roughness: 0.9, metalness: 0.0 });
-  const things = [0, 1].map(() => {
+  const grouped = (shapes) => {
     const group = new T.Group();
-    for (const shape of data.things || []) {
-      const mesh = new T.Mesh(geometry(shape), wood);
-      mesh.position.set(...shape.pos);
-      mesh.quaternion.set(shape.quat[1], shape.quat[2], shape.quat[3], shape.quat[0]);
-      mesh.castShadow = mesh.receiveShadow = true;
-      group.add(mesh);
-    }
+    for (const shape of shapes) group.add(solid(shape, wood));
     scene.add(group);
     return group;
-  });
-  const movers = data.movers.map((shape) => {
-    const [group, mesh] = [new T.Group(), new T.Mesh(geometry(shape), wood)];
-    mesh.position.set(...shape.pos);
-    mesh.quaternion.set(shape.quat[1], shape.quat[2], shape.quat[3], shape.quat[0]);
-    mesh.castShadow = mesh.receiveShadow = true;
-    group.add(mesh);
-    scene.add(group);
-    return group;
-  });
+  };
+  const things = [0, 1].map(() => grouped(data.things || []));
+  const movers = data.movers.map((shape) => grouped([shape]));
   const reference = character(true);
   const simulated = character(false);
   const others = data.others.map(() => character(false));
@@ -162,11 +89,7 @@ Poise.stageGL = (host, data, extent) => {
     kind: "webgl",
     canvas,
     theme() {
-      scene.background = new T.Color(Poise.css("--stage"));
-      scene.fog = new T.Fog(scene.background, 14, 40);
-      grid.uniforms.ink.value.set(Poise.css("--ink"));
-      grid.uniforms.strength.value = parseFloat(Poise.css("--grid")) || 0.2;
-      shade.material.opacity = parseFloat(Poise.css("--shade")) || 0.2;
+      base.theme("--stage");
       ghost.uniforms.tint.value.set(Poise.css("--ref"));
       ghost.uniforms.rim.value.set(Poise.css("--ref-rim"));
       arrowMaterial.color.set(Poise.css("--help"));
@@ -176,11 +99,7 @@ Poise.stageGL = (host, data, extent) => {
       colors.other = new T.Color(Poise.css("--other"));
       colors.lit = new T.Color(Poise.css("--contact"));
     },
-    resize(width, height) {
-      renderer.setSize(width, height, false);
-      camera.aspect = width / Math.max(height, 1);
-      camera.updateProjectionMatrix();
-    },
+    resize: base.resize,
     // Looks from the front and the side, far enough for both characters.
     home() {
       const view = 2 * Math.tan((camera.fov * Math.PI) / 360);
@@ -215,8 +134,9 @@ Poise.stageGL = (host, data, extent) => {
       things.forEach((group, k) => group.position.set(frame.shift[k][0], frame.shift[k][1], 0));
       movers.forEach((group, k) => {
         const w = frame.movers[k];
-        group.position.set(w[0] + frame.shift[1][0], w[1] + frame.shift[1][1], w[2]);
-        group.quaternion.set(w[4], w[5], w[6], w[3]);
+        place(group, w, 0);
+        group.position.x += frame.shift[1][0];
+        group.position.y += frame.shift[1][1];
       });
       things[0].visible = Math.hypot(rx - sx, ry - sy) > 1e-3;
       simulated.mats[0].color.copy(colors.sim);
@@ -246,12 +166,7 @@ Poise.stageGL = (host, data, extent) => {
       };
       pushed.forEach(point(frame.pushes));
       helped.forEach(point(frame.helps));
-      sun.target.position.set(controls.target.x, controls.target.y, 0);
-      sun.position.set(controls.target.x + 2.2, controls.target.y - 2.8, 6.5);
-      grid.uniforms.center.value.copy(controls.target);
-      floor.position.x = shade.position.x = controls.target.x;
-      floor.position.y = shade.position.y = controls.target.y;
-      renderer.render(scene, camera);
+      base.render();
     },
     project(x, y, z) {
       const p = new T.Vector3(x, y, z).project(camera);

@@ -1,0 +1,159 @@
+"""The next goal of each character: its person's pose, endless motion, or what its state asks for."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.live.characters import FALLS, RETURNS, EndlessCoords, tensor
+from poise.live.people import Own, People, calibrated
+from poise.live.protocol import LiveConfig
+from poise.live.stream import margin
+from poise.live.world import LiveWorld
+from poise.synthesis.generator import Kinematic
+
+#: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
+#: nothing is caught up with.
+CATCHES_UP, GIVES_UP_S = 0.15, 1.5
+#: s in which errors wander.
+WANDERS_S = 0.3
+
+
+class Targets:
+    """The people that come, and what characters make of them.
+
+    Args:
+        executor: calibrates and makes endless motion beside the loop; None does it at once.
+        generator: makes endless motion; None: there is none.
+
+    Attributes:
+        noise: 0 to 1, see `LiveConfig`.
+        endless: characters that follow endless motion.
+        read_s: when people were read last.
+    """
+
+    def __init__(
+        self,
+        world: LiveWorld,
+        config: LiveConfig,
+        executor: Executor | None,
+        generator: Kinematic | None,
+    ):
+        self.world, self.noise, self.generator = world, config.noise, generator
+        self._executor = executor
+        t = world.tracker
+        ease = t.recovery_clips.ease.numpy() if t.recovery_clips is not None else np.zeros(0)
+        body = {"humanoid": t.humanoid, "example": t.example, "ease": ease, "how": t.onto}
+        calibrate = partial(calibrated, **body)
+        self.people = People(config.characters, config.buffer_s, calibrate, executor)
+        self.endless = dict[int, EndlessCoords]()
+        self.read_s: float | None = None
+        self._errors = dict[int, np.ndarray]()
+        self._was = list[object]([None] * config.characters)
+        self.rng = np.random.default_rng(config.seed)
+        self.set_lead()
+
+    def next(self, now_s: float) -> tuple[Tensor, Tensor | None, tuple[Own | None, ...]]:
+        """What characters are to do in the control step at `now_s`.
+
+        Returns:
+            frames: `(K, 7 + n)`, the newest that the goals know.
+            places: `(K, B, 3)` m of the bodies, NaN where the frames tell them; None where they all do.
+            own: the people's poses that the frames are.
+        """
+        reads = self._reads(now_s)
+        every = (self._frame(k, reads) for k in range(self.world.count))
+        frames, places, own = zip(*every, strict=True)
+        if all(p is None for p in places):
+            return torch.stack(frames), None, own
+        out = torch.full((self.world.count, len(self.world.humanoid.bodies), 3), torch.nan)
+        for k, told in enumerate(places):
+            if told is not None:
+                out[k] = torch.from_numpy(told)
+        return torch.stack(frames), out, own
+
+    def _reads(self, now_s: float) -> float:
+        """When people are read: a step later than the last time, whenever the step comes, so that a slow
+        machine makes slow motion and no leaps; what is behind is caught up with gently."""
+        period, read = 1.0 / self.world.rate_hz, self.read_s
+        if read is None or abs(now_s - read) > GIVES_UP_S:
+            read = now_s
+        else:
+            share = 0.1 * (now_s - read - period) / period
+            read += period * (1.0 + min(max(share, -CATCHES_UP), CATCHES_UP))
+        self.read_s = read
+        return read
+
+    def _frame(self, k: int, now_s: float) -> tuple[Tensor, np.ndarray | None, Own | None]:
+        """The newest frame that character k's goal knows, where its bodies are, if that is told, and the
+        person's pose that it is."""
+        world, person = self.world, self.people.of(k)
+        character, endless = world.characters[k], self.endless.get(k)
+        qpos, own, places, stalled = None, None, None, False
+        follows = endless or self.people.follows[k]
+        if self._was[k] != follows:
+            self._was[k] = follows
+            character.blend()
+        if endless is not None:
+            made = endless.next(character.doing in (FALLS, RETURNS))
+            qpos = None if made is None else tensor(self._noisy(k, made)[0])
+        elif person is not None and person.ready() and person.onto is not None:
+            pose = person.read(now_s + 1.0 / world.rate_hz)
+            if pose is not None:
+                if pose.jumped:
+                    character.jump()
+                stalled = pose.stalled
+                onto = person.onto
+                if pose.places is not None:
+                    places = onto.where.points(pose.places)
+                made, places = self._noisy(k, onto(pose.root_pos, pose.rot), places)
+                qpos, where = tensor(made), replace(onto.where)
+                own = Own(onto.passage.source, pose.root_pos, pose.rot, where, onto.scale)
+        frame = character.next(qpos, world.body(k), stalled)
+        if character.moved is not None:
+            # Its motion goes on from elsewhere.
+            seen, to = (x.numpy() for x in character.moved)
+            if endless is not None:
+                endless.move(seen, to)
+            elif person is not None and person.onto is not None:
+                person.onto.where.move(seen, to)
+        return (frame, places, own) if frame is qpos else (frame, None, None)
+
+    def _noisy(
+        self, k: int, qpos: np.ndarray, places: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Coordinates `(7 + n)` and places `(B, 3)` with errors."""
+        size = self.noise
+        if size:
+            # x' = a x + sqrt(1 - a^2) e: errors that wander, as those of estimators do.
+            a = np.exp(-1.0 / (WANDERS_S * self.world.rate_hz))
+            width = len(qpos) + (0 if places is None else places.size)
+            drawn = self.rng.normal(0.0, 1.0, width)
+            old = self._errors.get(k, drawn)
+            old = old if len(old) == width else drawn
+            wander = self._errors[k] = a * old + np.sqrt(1.0 - a * a) * drawn
+            n = len(qpos)
+            qpos[7:] += 0.1 * size * wander[7:n]
+            qpos[:3] += 0.03 * size * wander[:3]
+            if places is not None:
+                places = places + 0.03 * size * wander[n:].reshape(places.shape)
+        return qpos, places
+
+    def set_lead(self) -> None:
+        """How many frames goals are behind what is read, by the length of the buffer."""
+        delay = self.people.delay_s
+        lead = 1 + int((delay - margin(delay)) * self.world.rate_hz + 1e-6)
+        self.world.set_lead(lead)
+
+    def dream(self, k: int, on: bool) -> None:
+        """A character begins endless motion, or goes back to its person."""
+        if not on:
+            self.endless.pop(k, None)
+        elif self.generator is not None and k not in self.endless:
+            seed = int(self.rng.integers(2**31))
+            self.endless[k] = EndlessCoords(self.generator, seed, self._executor)

@@ -1,0 +1,238 @@
+"""Scenes played by a trained policy: with compliance and without, side by side in figures.
+
+played = play(Hands(), clip=read_clip("walk.bvh"), given=Stiffness(200.0))
+played.figures["force_mean_n"], played.write(Path("out"))
+"""
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from poise.control import Compliance, Stiffness
+from poise.env import ImitationEnv
+from poise.errors import PoiseError
+from poise.formats import write_clip
+from poise.formats.text import write_whole
+from poise.jobs.deliver import make_report, simulated_clip
+from poise.jobs.open import open_run
+from poise.jobs.runs import Evaluation, scored
+from poise.jobs.track import imitation_of
+from poise.jobs.track.controllers import RULE, look_ahead
+from poise.jobs.track.placement import place
+from poise.jobs.tracker import Tracker
+from poise.motion import Clip
+from poise.papers.compliant.motions import motion_of, standing
+from poise.papers.compliant.opponents import opposing, rival_stage, weighed
+from poise.papers.compliant.scene_training import LearnedOnTop, Topped, seen
+from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
+from poise.papers.compliant.watch import Watch, meter_of, words_of
+from poise.plan import LookaheadConfig
+from poise.recipes.imitation import Imitation
+from poise.score import run_episodes, write_score
+from poise.score.report import Mover, write_report
+from poise.score.rollouts import RolloutSet
+
+#: What the figures are, in words.
+WORDS = {
+    "force_mean_n": "Interaction force, mean while it acts, N",
+    "force_peak_n": "Interaction force, greatest, N",
+    "impulse_ns": "Interaction impulse, N s",
+    "torque_nm": "Servos' torque, mean of the hinges, N m",
+    "goal_moved_m": "Goal gave way, most of its bodies' mean, m",
+    "steps": "Steps of both feet",
+    "off_m": "Distance from the goal, mean, m",
+    "lost": "Episodes lost",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """What came of a scene.
+
+    Attributes:
+        scene: its name.
+        words: what the figures are, by their keys.
+        imitation: the task of the compliant character.
+        evaluation: its episodes and score.
+        figures, stiff: by the keys of `words`, of the compliant character and of its twin that does not
+            give way; means over the episodes, `lost` their count.
+        count: of the episodes of each.
+        arrows: of each frame of the first episode `(K, 6)`: points, m, and forces felt there, N.
+        movers: what moves in its world.
+    """
+
+    scene: str
+    words: Mapping[str, str]
+    imitation: Imitation
+    evaluation: Evaluation
+    figures: Mapping[str, float]
+    stiff: Mapping[str, float]
+    count: int
+    arrows: tuple[np.ndarray, ...]
+    movers: tuple[Mover, ...]
+
+    @property
+    def clip(self) -> Clip:
+        """The first episode's motion on the policy's skeleton."""
+        return simulated_clip(self.imitation, self.evaluation)
+
+    def sentence(self) -> str:
+        """What the compliance changed, in words."""
+        a, b = self.figures["force_mean_n"], self.stiff["force_mean_n"]
+        share = 1.0 if b == 0.0 else a / b
+        less = f"{abs(1.0 - share):.0%} {'less' if share < 1.0 else 'more'}"
+        lost, others = (f"{f['lost']:.0f}" for f in (self.figures, self.stiff))
+        episodes = "1 episode" if self.count == 1 else f"{self.count} episodes"
+        if "stays_s" in self.figures:
+            # The forces are fictional there, so that their size tells nothing.
+            c, d = (f"{f['stays_s']:.1f} s" for f in (self.figures, self.stiff))
+            told = f"{episodes}: the ball stays for {c}, {d} without"
+            return f"{told}; {lost} were lost, {others} without."
+        return (
+            f"{episodes}: the interaction force is {a:.1f} N on average, {less} than without "
+            f"compliance ({b:.1f} N); {lost} were lost, {others} without."
+        )
+
+    def write(self, out: Path) -> dict[str, Path]:
+        """`simulated.bvh`, `score.json`, `figures.json` and `report.html` in a folder."""
+        out.mkdir(parents=True, exist_ok=True)
+        paths = {k: out / n for k, n in (("simulated", "simulated.bvh"), ("figures", "figures.json"))}
+        write_clip(self.clip, paths["simulated"])
+        told = {"scene": self.scene, "episodes": self.count, "compliant": dict(self.figures),
+                "without": dict(self.stiff)}  # fmt: skip
+        write_whole(paths["figures"], json.dumps(told, indent=1) + "\n")
+        paths["score"] = write_score(self.evaluation.card, out / "score.json")
+        report = make_report(self.imitation, self.evaluation, {})
+        frames = len(report.reference.pos)
+        report = replace(
+            report, title=_title(self.scene, report.title), movers=self.movers,
+            pushes=self.arrows if len(self.arrows) == frames else (),
+            notes=(self.sentence(), *report.notes),
+        )  # fmt: skip
+        paths["report"] = out / "report.html"
+        write_report(report, paths["report"])
+        return paths
+
+
+def play(
+    scene: PlayScene,
+    policy: Tracker | str | Path | None = None,
+    clip: Clip | None = None,
+    given: Compliance | Stiffness | None = None,
+    count: int = 16,
+    seconds: float = 8.0,
+    threads: int = 0,
+    name: str = "",
+    learned: LearnedOnTop | None = None,
+    controller: Literal["policy", "lookahead"] = "policy",
+    lookahead: LookaheadConfig | None = None,
+) -> Played:
+    """A scene with compliance and without, from starts that differ by a hair.
+
+    Args:
+        policy: see `poise.track`.
+        clip: what the character does; None stands at ease for so many `seconds`.
+        given: how it gives way; None is what suits the scene, Compliance() for most.
+        count: of episodes, side by side.
+        name: of the scene, by default that of its class.
+        learned: what was learned on top of the policy, for the character that gives way; it gives way as
+            it has learned to.
+        controller: the policy alone, or with lookahead, which simulates the scene with all that is going
+            to happen in it; not with what was learned on top, nor against an opponent.
+        lookahead: how it looks ahead.
+
+    Raises:
+        PoiseError: the body cannot do the scene, or the clip cannot be read.
+    """
+    if controller == "lookahead" and (learned or getattr(scene, "against", "") == "rival"):
+        what = "against an opponent" if learned is None else "with what was learned on top"
+        raise PoiseError(
+            f"lookahead does not act {what}",
+            name or "play",
+            "Take controller='policy'",
+            code="settings-conflict",
+        )
+    tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
+    own_motion = motion_of(scene, tracker, seconds)
+    if clip is not None and own_motion is not None:
+        raise PoiseError(
+            "the scene has a motion of its own",
+            name or "play",
+            "Leave the clip out",
+            code="settings-conflict",
+        )
+    clip = clip or own_motion
+    task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
+    rival: Imitation | None = None
+    if isinstance(scene, Chicken):
+        task = weighed(task, scene.mass)
+    stage = scene.stage(task.humanoid, task.reference)
+    if isinstance(scene, Chicken) and scene.against == "rival":
+        stage, rival = rival_stage(scene, tracker, stage)
+    task = replace(task, props=stage.props, links=stage.links, touches=stage.touches, floor=stage.floor)
+    both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
+    if learned is not None:
+        given = learned.config.given()
+    for compliance in (stage.yields(given), None):
+        others = () if rival is None else (opposing(rival, tracker, compliance),)
+        events = (*stage.events, *others)
+        own = replace(task.task, events=events, compliance=compliance, help_by="all")
+        top = None if compliance is None else learned
+        if top is not None:
+            own = replace(own, obs=(*own.obs, *seen(stage)))
+        ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
+        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
+    (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
+    called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
+    return Played(
+        called, {**WORDS, **words_of(scene)}, imitation, evaluation,
+        looked.figures(rollouts, task), other.figures(others, task), count,
+        tuple(looked.arrows), looked.movers(),
+    )  # fmt: skip
+
+
+def _title(scene: str, motion: str) -> str:
+    return motion if scene in motion.split() else f"{scene}, {motion}"
+
+
+def _episodes(
+    scene: PlayScene,
+    tracker: Tracker,
+    task: Imitation,
+    count: int,
+    threads: int,
+    learned: LearnedOnTop | None = None,
+    lookahead: LookaheadConfig | None = None,
+) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
+    zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
+    topped = None if learned is None else Topped(tracker.policy, learned.top, learned.added)
+    ahead = look_ahead(tracker, task, lookahead, threads) if lookahead else None
+
+    def make(worlds: int) -> ImitationEnv:
+        env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
+        watch.begin(env)
+        if ahead is not None:
+            ahead.watch(env)
+        if topped is not None:
+            topped.begin(env)
+        return env
+
+    try:
+        rollouts, recordings = run_episodes(
+            make, ahead or topped or tracker.policy, zero, zero, cycles=1, observers=[watch],
+            trial=torch.arange(count),
+        )  # fmt: skip
+    finally:
+        if ahead is not None:
+            ahead.copies.close()
+    card = scored(rollouts, task, tracker.about, RULE, tracker.config.method)
+    return task, rollouts, watch, Evaluation(card, rollouts, recordings, False)
