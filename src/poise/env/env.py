@@ -388,7 +388,7 @@ class ImitationEnv:
             event.judged(outcome)
         failed, terminated, truncated = ends.unbind(0)
         if task.completion_bonus:
-            # r (1 + b): with b = g + g^2 + ..., as many of these rewards as who goes on would earn.
+            # r (1 + b): with b = g + g^2 + ..., as many of these rewards as one that goes on earns.
             done = terminated & ~failed
             reward = torch.where(done, reward * (1.0 + task.completion_bonus), reward)
         limit = None if self._limit_n is None else self.help.limit(self._limit_n, self._group)
