@@ -6,11 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.endless.training import Endless
 from poise.jobs.inbetween.settings import Inbetween, small
 from poise.motion import Clip
 from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.residual_force_settings import ResidualForce
+from poise.settings import imported
+
+
+def _endless() -> Any:
+    # Its settings stand beside its training, which takes seconds to import.
+    return imported("poise.jobs.endless.training:Endless")
+
 
 #: The names of presets.
 NAMES = ("paper", "code", "fast")
@@ -27,7 +33,7 @@ _PRESETS: dict[str, dict[str, Callable[..., Any]]] = {
         "paper": lambda _: Inbetween.paper(), "code": lambda _: Inbetween.code(),
         "fast": lambda _: small(Inbetween()),
     },
-    "endless": {"paper": lambda _: Endless.paper(), "fast": lambda _: Endless()},
+    "endless": {"paper": lambda _: _endless().paper(), "fast": lambda _: _endless()()},
 }  # fmt: skip
 
 
