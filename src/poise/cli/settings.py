@@ -158,7 +158,9 @@ def base_of(
         return from_toml(type(default), config, verb)
     if preset is None:
         return default
-    return imported("poise.jobs.presets:preset_of")(recipe, preset, clip)
+    from poise.jobs.presets import preset_of
+
+    return preset_of(recipe, preset, clip)
 
 
 def dotted(argv: Sequence[str]) -> list[str]:
