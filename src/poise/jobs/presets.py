@@ -6,25 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
-<<<<<<< HEAD
-from poise.jobs.endless.endless_training import Endless
 from poise.jobs.inbetween.inbetween_settings import Inbetween, small
-=======
-from poise.jobs.inbetween.inbetween_settings import Inbetween, small
->>>>>>> track65
 from poise.motion import Clip
 from poise.recipes.perpetual_settings import BY_STAGES
 from poise.recipes.residual_force_settings import ResidualForce
 from poise.settings import imported
-<<<<<<< HEAD
-=======
 
 
 def _endless() -> Any:
     # Its settings stand beside its training, which takes seconds to import.
     return imported("poise.jobs.endless.endless_training:Endless")
 
->>>>>>> track65
 
 #: The names of presets.
 NAMES = ("paper", "code", "fast")
