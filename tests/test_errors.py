@@ -46,7 +46,7 @@ def words_in(code: ast.expr) -> list[str]:
 @pytest.mark.parametrize("folder", ["src/poise", "benchmarks"])
 def test_every_error_has_a_code(folder: str) -> None:
     found = list(calls(folder))
-    assert len(found) > 20
+    assert len(found) > (200 if folder == "src/poise" else 5)
     assert [place for place, call in found if code_of(call) is None] == []
     said = [(place, word) for place, call in found for word in words_in(code_of(call))]  # type: ignore[arg-type]
     assert [(place, word) for place, word in said if not CODE.fullmatch(word)] == []

@@ -256,7 +256,7 @@ def figures(places: Places, raws: Raws, subject: str) -> Iterator[Figure]:
             "decision_ms_p50": times[len(times) // 2],
             "decision_ms_p99": times[int(0.99 * (len(times) - 1))],
         }
-        values["steps_a_step"] = mean_of(e["steps_a_step"] for e in rows)
+        values["steps_a_step"] = mean_of(e.get("steps_a_step") for e in rows)
     values["core_s_a_s"] = median_of(e["core_s_a_s"] for e in rows)
     yield from of(subject, values, len(rows), seeds=len(trials))
 
