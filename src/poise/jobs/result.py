@@ -3,6 +3,7 @@
 made.clip, made.card, made.notes, made.save("out")
 """
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math
