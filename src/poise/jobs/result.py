@@ -3,6 +3,9 @@
 made.clip, made.card, made.notes, made.save("out")
 """
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
+# A field that is ABSENT is None, though its type says what others have.
+# pyright: reportUnnecessaryComparison=false
 from __future__ import annotations
 
 import math
