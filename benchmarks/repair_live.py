@@ -20,8 +20,8 @@ from repair import KINDS, dirty
 from repair_rivals import one_euro
 
 from poise.kinematics.stream_noise import of_points
+from poise.live.people import Steady
 from poise.live.sources import Loop
-from poise.live.stream import Steady
 from poise.motion import Clip
 
 KINDS_LIVE, SIZES_MM, CLIPS = ("white", "tone5"), (10.0, 25.0, 50.0), 10

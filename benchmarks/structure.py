@@ -229,18 +229,26 @@ def words(tree: ast.Module, imports: bool) -> Counter[str]:
     return used
 
 
+def imports(
+    source: Path, trees: dict[Path, ast.Module]
+) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
+    """Modules of the package in `source` that each of them imports: at its top, and anywhere."""
+    names = {p: ".".join((source.name, *p.relative_to(source).with_suffix("").parts)) for p in trees}
+    names = {p: n.removesuffix(".__init__") for p, n in names.items()}
+    modules, top, everywhere = set(names.values()), {}, {}
+    for p, tree in trees.items():
+        found = Imports(names[p], p.name == "__init__.py", modules)
+        found.visit(tree)
+        top[names[p]], everywhere[names[p]] = found.top, found.all
+    return top, everywhere
+
+
 def structure(source: Path) -> dict[str, Any]:
     """All counts of the package in a folder."""
     paths = sorted(source.rglob("*.py"))
     texts = {p: p.read_text(encoding="utf-8") for p in paths}
     trees = {p: ast.parse(text) for p, text in texts.items()}
-    names = {p: ".".join((source.name, *p.relative_to(source).with_suffix("").parts)) for p in paths}
-    names = {p: n.removesuffix(".__init__") for p, n in names.items()}
-    modules, top, everywhere = set(names.values()), {}, {}
-    for p in paths:
-        found = Imports(names[p], p.name == "__init__.py", modules)
-        found.visit(trees[p])
-        top[names[p]], everywhere[names[p]] = found.top, found.all
+    top, everywhere = imports(source, trees)
     used: Counter[str] = Counter()
     for p in paths:
         used += words(trees[p], imports=p.name != "__init__.py")

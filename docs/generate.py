@@ -28,7 +28,7 @@ MARK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Parts of the API page, in its order: a title, a package, its names.
 SHOWN: tuple[tuple[str, str, str], ...] = (
     ("Verbs", "poise", "read write track imitate push inbetween complete dream open_run"),
-    ("Results", "poise", "Tracked Imitated Completed Inbetweened Dreamt Run PoiseError"),
+    ("Results", "poise", "Result Dreamt Run PoiseError"),
     ("Settings", "poise", "TrackConfig ResidualForce Perpetual Inbetween Dream"),
     ("Motion", "poise.motion", "Clip ClipLibrary Skeleton trim resample"),
     ("Motion", "poise.formats", "read_clip write_clip"),
@@ -41,8 +41,8 @@ SHOWN: tuple[tuple[str, str, str], ...] = (
     ("Environments", "poise.env", "GymVectorEnv GymEnv"),
     ("Environments", "poise.env.faces", "RslRlVecEnv"),
     ("Environments", "poise.env.pushes", "Pushes Push"),
-    ("Environments", "poise.env.events", "InScene"),
-    ("Environments", "poise.env.things", "SetDown Throw"),
+    ("Environments", "poise.env.scene", "InScene"),
+    ("Environments", "poise.env.scene", "SetDown Throw"),
     ("Environments", "poise.control", "Compliance Stiffness"),
     ("Learning", "poise.learn", "PPOConfig Until run Trainer"),
     ("Simulation", "poise.sim", "Scene Character Link Touch SceneSim SimConfig make_backend Mechanics"),

@@ -91,7 +91,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an untrained in-betweening network for the embedded walk."""
     from poise.formats import read_clip
-    from poise.learn.inbetween import MODEL, InbetweenModel, make_net, save_model
+    from poise.learn.inbetween_model import MODEL, InbetweenModel, make_net, save_model
     from poise.learn.transition import SkeletonLayout
     from poise.motion.windows import pack_frames
     from toy_windows import SMALL

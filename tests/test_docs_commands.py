@@ -19,7 +19,7 @@ import pytest
 
 from poise.cli.main import main
 from poise.formats import read_clip, write_clip
-from poise.jobs.endless.training import Endless
+from poise.jobs.endless.endless_training import Endless
 from poise.learn.cvae import CVAEConfig
 from poise.motion import Clip, trim
 from poise.recipes import ResidualForce

@@ -24,7 +24,7 @@ EXPLAINED = {
     "twins in tests and benchmarks": (
         "control/pd.py:stable_pd_torque", "sim/backend.py:body_angular_velocity_w",
         "sim/backend.py:body_linear_velocity_w", "sim/backend.py:body_com_velocity_w",
-        "metrics/tracking.py:mpjpe_pa",
+        "metrics/tracking_errors.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
         "jobs/track/noise.py:robustness",
@@ -41,7 +41,7 @@ EXPLAINED = {
         "formats/smpl.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField", "sim/floor.py:Steps",
         "sim/props.py:Lift",
-        "papers/compliant/opponents.py:Teams", "papers/compliant/training.py:save_learned",
+        "papers/compliant/opponents.py:Teams", "papers/compliant/scene_training.py:save_learned",
     ),
     "called by the libraries that they belong to": (
         "env/faces.py:GymVectorEnv.close_extras", "formats/pickles.py:_Machine.find_class",

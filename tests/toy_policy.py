@@ -7,7 +7,7 @@ from pathlib import Path
 import poise
 from made_once import copied
 from poise.formats import read_clip
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.learn import PPOConfig, Until
 from poise.motion import Clip, ClipLibrary, trim
 from poise.recipes.perpetual_settings import Perpetual

@@ -8,7 +8,7 @@ import torch
 
 from poise.learn.between import BetweenConfig
 from poise.learn.transition import Known, SkeletonLayout
-from poise.learn.windows import FrameData
+from poise.learn.window_sampler import FrameData
 from poise.motion.windows import FrameBank, pack_frames, step_contacts, train_statistics
 from poise.papers.skeleton2humanoid.rtn import RTNConfig
 from toy_human import swing

@@ -15,11 +15,11 @@ from pathlib import Path
 import torch
 from tracker import HELD_OUT, SIXTY, TWINS
 
+from poise.jobs.endless.endless_training import Endless, begin, train_generator
 from poise.jobs.endless.model import read_labels
-from poise.jobs.endless.training import Endless, begin, train_generator
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.learn.inbetween import BlockStats
+from poise.learn.inbetween_model import BlockStats
 
 
 def shown(stats: BlockStats) -> None:

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import torch
 
-from poise.jobs.inbetween.training import Inbetween, begin, train
+from poise.jobs.inbetween.inbetween_training import Inbetween, begin, train
 from poise.jobs.library.clips import LibraryConfig
 from poise.learn.between import BetweenConfig, BetweenTraining
-from poise.learn.inbetween import BlockStats, load_model, save_model
+from poise.learn.inbetween_model import BlockStats, load_model, save_model
 
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, boxing and exercises of 14,
 #: walks of 38, 39 and 43. The figures are of these.

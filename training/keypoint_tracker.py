@@ -26,7 +26,7 @@ from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.distillation import distilled, taught_by
-from poise.jobs.perpetual.run import begin, clips_of, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, clips_of, resume, train
 from poise.jobs.tracker import SHIPPED
 from poise.jobs.warm_start import CLONE_WORLDS, widened
 from poise.learn import LATEST, CloneConfig, Until

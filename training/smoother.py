@@ -26,7 +26,7 @@ from poise.env import ImitationEnv
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.perpetual.run import clips_of
+from poise.jobs.perpetual.perpetual_run import clips_of
 from poise.jobs.tracker import save_tracker
 from poise.learn import PolicyBundle
 from poise.recipes.perpetual import build
@@ -129,9 +129,9 @@ def main() -> None:
         hard = its & ~own
         print(f"{int(own.sum())} of {len(library)} clips done, {int(hard.sum())} more by the other")
     env = task.env(a.worlds, a.seed, threads=a.threads or 1, help_scale=0.0, guard=False)
-    assert task.task.velocities is not None
     noise = torch.zeros(env.num_obs)
-    noise[slice(*task.task.velocities)] = a.noise
+    for name in task.task.velocities:
+        noise[env.columns[name]] = a.noise
     if hard.any():
         odds = env.weights
         env.weights = torch.where(hard, SHARE / odds[hard].sum(), (1 - SHARE) / odds[~hard].sum()) * odds

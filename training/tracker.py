@@ -30,7 +30,7 @@ from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import begin, clips_of, going_on, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, clips_of, going_on, resume, train
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import SMALL_STEP, widened
 from poise.learn import ConvergenceConfig, Until

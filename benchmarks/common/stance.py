@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from poise.body import Humanoid
-from poise.body.table import BodyRow
+from poise.body.body_table import BodyRow
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_to_matrix
 

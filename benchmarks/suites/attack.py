@@ -102,8 +102,8 @@ _CLOCKS = ("seconds", "crc32", "minutes", "begun")
 
 def miniature(folder: Path) -> None:
     """Clips and settings of trainings that take seconds."""
-    from poise.jobs.endless.training import Endless
-    from poise.jobs.inbetween.settings import Inbetween, small
+    from poise.jobs.endless.endless_training import Endless
+    from poise.jobs.inbetween.inbetween_settings import Inbetween, small
     from poise.learn.cvae import CVAEConfig
     from poise.settings import to_toml
 

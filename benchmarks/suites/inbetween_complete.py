@@ -30,11 +30,11 @@ from poise.formats import read_clip, write_clip
 from poise.formats.own import unpack_clips
 from poise.jobs.complete import complete
 from poise.jobs.inbetween.fill import inbetween, shipped_model
-from poise.jobs.inbetween.settings import small
-from poise.jobs.inbetween.training import Inbetween, Task, begin, train
+from poise.jobs.inbetween.inbetween_settings import small
+from poise.jobs.inbetween.inbetween_training import Inbetween, Task, begin, train
 from poise.jobs.open import open_run
 from poise.kinematics import retarget
-from poise.learn.inbetween import MODEL, Adaptation, InbetweenModel, adapt, load_model
+from poise.learn.inbetween_model import MODEL, Adaptation, InbetweenModel, adapt, load_model
 from poise.learn.transition import FilledGap, Known, SkeletonLayout
 from poise.metrics import l2p
 from poise.motion import Clip, Skeleton, trim

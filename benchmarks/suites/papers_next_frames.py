@@ -161,7 +161,7 @@ def _layers(sizes: tuple[int, ...], bent: bool) -> nn.Sequential:
 
 
 class NextFrameObjective:
-    """Loss and update; see `learn.inbetween.InbetweenTrainer`.
+    """Loss and update; see `learn.inbetween_model.InbetweenTrainer`.
 
     Args:
         batch: windows in a step. lr: Adam's step size.

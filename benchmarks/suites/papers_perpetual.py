@@ -24,14 +24,14 @@ from poise.body import BodyConfig
 from poise.jobs import runs
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import RESULT, begin, clips_of, resume, train
+from poise.jobs.perpetual.perpetual_run import RESULT, begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import AmpConfig, CloneConfig, PPOConfig, Until
 from poise.motion import ClipLibrary
 from poise.papers.perpetual.ablations import StagedPerpetual
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.shapes import BodyShapes
 
 SAMPLES, SEEDS = 2_000_000, (0, 1)
 #: The library: walks, runs and jumps of five subjects.

@@ -36,8 +36,8 @@ from poise.body import BodyConfig, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, EnvStep, ImitationEnv, Reference
 from poise.env.generator import MotionGenerator
+from poise.jobs.endless.endless_training import codes_of, reach_of
 from poise.jobs.endless.model import Motions, spread
-from poise.jobs.endless.training import codes_of, reach_of
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import subject_of
 from poise.jobs.library.folder import library_of
@@ -49,7 +49,7 @@ from poise.kinematics.fit import widen
 from poise.kinematics.loops import repeated
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.cvae import CVAEConfig, CVAEObjective, CVAETraining, PackedFrames, make_cvae
-from poise.learn.inbetween import InbetweenTrainer
+from poise.learn.inbetween_model import InbetweenTrainer
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task as universal_task

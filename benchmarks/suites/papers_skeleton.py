@@ -39,7 +39,7 @@ from poise.metrics import l2p
 from poise.motion import Clip, ClipLibrary, shifted, trim
 from poise.motion.rotations import forward_kinematics
 from poise.motion.windows import pack_frames
-from poise.papers.compliant.training import digest_of
+from poise.papers.compliant.scene_training import digest_of
 from poise.papers.skeleton2humanoid.recipe import Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce

@@ -29,7 +29,8 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.figures import measure, slope, throws
 from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
-from poise.papers.compliant.play import play
+from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.scene_training import shipped
 from poise.papers.compliant.scenes import (
     Balance,
     Chicken,
@@ -39,7 +40,6 @@ from poise.papers.compliant.scenes import (
     Throws,
     TrampolineScene,
 )
-from poise.papers.compliant.training import shipped
 from poise.papers.compliant.watch import PUSHED_S
 from poise.sim import SimConfig
 
@@ -60,7 +60,7 @@ def cost(tracker: Tracker, many: int, steps: int, repeats: int) -> dict[str, Any
     push = Pushes((20.0, 20.0), (0.03, 0.03), 100.0, task.humanoid.rows_of("hand"))
     envs = {}
     for name, given in (("without", None), ("eq8", Compliance()), ("stiffness", Stiffness())):
-        own = replace(task.task, plugins=(push,), compliance=given, dones=(), help_by="all")
+        own = replace(task.task, events=(push,), compliance=given, dones=(), help_by="all")
         envs[name] = replace(task, task=own).env(
             many, auto_reset=False, threads=1, help_scale=0.0, guard=False
         )

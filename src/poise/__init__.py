@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from poise.jobs.endless.dreamt import Dream, Dreamt
     from poise.jobs.imitate import imitate
     from poise.jobs.inbetween.fill import inbetween
-    from poise.jobs.inbetween.settings import Inbetween
+    from poise.jobs.inbetween.inbetween_settings import Inbetween
     from poise.jobs.open import Run, open_run
     from poise.jobs.push import push
     from poise.jobs.result import Result
@@ -45,7 +45,7 @@ _PLACES = {
     "ClipLibrary": "poise.motion",
     "Dream": "poise.jobs.endless.dreamt",
     "Dreamt": "poise.jobs.endless.dreamt",
-    "Inbetween": "poise.jobs.inbetween.settings",
+    "Inbetween": "poise.jobs.inbetween.inbetween_settings",
     "Perpetual": "poise.recipes.perpetual",
     "ResidualForce": "poise.recipes",
     "Result": "poise.jobs.result",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from benchmarks.suites.inbetween_complete import best_setting, choose_iterations
-from poise.learn.inbetween import Adaptation, make_net
+from poise.learn.inbetween_model import Adaptation, make_net
 from toy_windows import SMALL, bank, known, layout
 
 

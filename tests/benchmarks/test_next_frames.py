@@ -12,7 +12,7 @@ from benchmarks.suites.papers_next_frames import (
     NextFrames,
 )
 from poise.learn.cvae import PackedFrames
-from poise.learn.inbetween import InbetweenTrainer
+from poise.learn.inbetween_model import InbetweenTrainer
 from poise.synthesis.generator import ROOT
 from refusals import refused
 

@@ -135,7 +135,7 @@ def test_children_and_giants_stand_at_the_same_settings(height):
 
 def test_strength_that_follows_mass_alone_lets_a_giant_sag_more():
     # The reason for the rule: the same giant with the strength of its mass alone.
-    from poise.body.table import length_factor
+    from poise.body.body_table import length_factor
 
     clip = scaled(swing(), 3.5 / generate_table(human()).height_m)
     full = body_of(clip)

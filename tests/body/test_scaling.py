@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from poise.body import generate_table
-from poise.body.table import Strength, default_mass, length_factor
+from poise.body.body_table import Strength, default_mass, length_factor
 from toy_human import human
 
 TOY_M = 0.82 / 0.491

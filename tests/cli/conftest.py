@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from tiny_clips import MINIATURE, deepmimic, put
 
+from made_once import copied
 from poise.cli.main import main
 
 
@@ -21,9 +22,11 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory, clip: Path) -> Path:
     """The result folder of a miniature training; tests that change it take a copy."""
-    out = tmp_path_factory.mktemp("results") / "stand"
-    assert main(["imitate", str(clip), "-o", str(out), *MINIATURE]) == 0
-    return out
+
+    def make(place: Path) -> None:
+        assert main(["imitate", str(clip), "-o", str(place / "stand"), *MINIATURE]) == 0
+
+    return copied("imitated", make, tmp_path_factory.mktemp("results")) / "stand"
 
 
 def listing(folder: Path) -> list[str]:

@@ -10,7 +10,7 @@ import pytest
 from poise.cli.dream import targets_of
 from poise.cli.main import main
 from poise.formats import read_clip, write_clip
-from poise.jobs.endless.training import Endless
+from poise.jobs.endless.endless_training import Endless
 from poise.learn.cvae import CVAEConfig
 from poise.settings import to_toml
 from refusals import refused

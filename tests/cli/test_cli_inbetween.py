@@ -11,7 +11,7 @@ import pytest
 from poise.cli.main import main
 from poise.formats import read_clip
 from poise.jobs.inbetween.fill import shipped_model
-from poise.learn.inbetween import load_model
+from poise.learn.inbetween_model import load_model
 
 
 def test_it_fills_without_training_and_keeps_keyframes(

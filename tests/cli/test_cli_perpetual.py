@@ -12,7 +12,7 @@ from tiny_clips import deepmimic, put
 from poise.cli import train_perpetual
 from poise.cli.main import main
 from poise.jobs.open import open_run
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import LATEST, CloneConfig, PPOConfig
 from poise.papers.perpetual.ablations import StagedPerpetual

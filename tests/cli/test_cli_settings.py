@@ -17,10 +17,10 @@ from poise.cli.main import main
 from poise.cli.parse import parse
 from poise.cli.settings import SOURCES, configured, dotted, stated
 from poise.formats import read_clip
-from poise.jobs.endless.training import Endless
-from poise.jobs.inbetween.training import Inbetween
+from poise.jobs.endless.endless_training import Endless
+from poise.jobs.inbetween.inbetween_training import Inbetween
 from poise.jobs.presets import preset_of
-from poise.papers.compliant.training import Compliant
+from poise.papers.compliant.scene_training import Compliant
 from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.papers.perpetual.trajopt import TrajOptConfig
 from poise.recipes import ResidualForce

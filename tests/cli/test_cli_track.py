@@ -131,8 +131,10 @@ def test_a_motion_that_is_lost_is_looked_for(
 
 
 def test_by_default_it_looks_ahead(
-    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    short = tmp_path / "short.bvh"
+    write_clip(trim(read_clip(WALK), 0, 20), short)
     argv = ["track", str(short), "--policy", str(file), "--characters", "8", "--threads", "1"]
     code = main([*argv, "-o", str(tmp_path / "a"), "--budget", "60", "--seed", "1"])
     said = capsys.readouterr()

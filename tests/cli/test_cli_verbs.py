@@ -144,8 +144,8 @@ def test_what_tyro_refuses_becomes_one_sentence() -> None:
 
 def test_choices_are_those_of_the_parts_behind_them() -> None:
     from poise.cli.train import RECIPES
-    from poise.jobs.inbetween import training as inbetween
-    from poise.metrics.tracking import RULES
+    from poise.jobs.inbetween import inbetween_training as inbetween
+    from poise.metrics.tracking_errors import RULES
     from poise.recipes import RECIPE, perpetual
 
     assert get_args(options.Rule) == tuple(RULES)

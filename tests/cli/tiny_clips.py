@@ -114,4 +114,4 @@ def put(folder: Path, name: str, text: str | bytes) -> Path:
 
 
 #: Options of a training that takes seconds.
-MINIATURE = ["--iterations", "2", "--envs", "16", "--threads", "1"]
+MINIATURE = ["--iterations", "2", "--envs", "16", "--threads", "1", "--no-expert"]

@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
 from poise.env.bins import MotionBins, Outcomes
-from poise.env.plugins import EVERY, KEPT, PRIOR, AdaptiveSampling
+from poise.env.events import EVERY, KEPT, PRIOR, AdaptiveSampling
 from poise.env.starts import Starts
 from poise.recipes.imitation import Imitation
 from refusals import refused
@@ -249,7 +249,7 @@ def test_a_run_goes_on_where_it_was(task: Imitation):
     one.reset()
     for _ in range(EVERY + 20):
         one.step(torch.randn(6, one.num_actions, generator=rng))
-    rates = one.plugin(AdaptiveSampling)
+    rates = one.event(AdaptiveSampling)
     assert rates is not None and float(rates.odds.max()) > 0.1
     two.load_state(one.state())
     for _ in range(EVERY):

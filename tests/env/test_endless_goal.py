@@ -51,7 +51,7 @@ def task(tracker: Tracker) -> Imitation:
 def begun(task: Imitation, goal: Recovering) -> tuple[ImitationEnv, Tensor]:
     """An environment with its characters on the goal."""
     env = task.env(goal.num_envs, auto_reset=False, threads=1, help_scale=0.0)
-    goal.draw(torch.arange(goal.num_envs))
+    goal.reset(torch.arange(goal.num_envs))
     env.backend.write(None, *goal.start(None))
     env.age[:] = 0
     return env, env.set_goal(goal)
@@ -125,7 +125,7 @@ def test_the_generator_may_see_what_was_done(tracker: Tracker, task: Imitation) 
 
     motion = GeneratorGoal(Keeps(ease), task.humanoid, 30.0, lead=1, simulated=True)
     goal = Recovering(motion, None)
-    goal.draw(torch.zeros(1, dtype=torch.long))
+    goal.reset(torch.zeros(1, dtype=torch.long))
     goal.aim(None, None)
     pos, still = goal.layout.unpacked(goal.now()).pos, torch.zeros(1, len(task.humanoid.bodies), 3)
     did = list[Tensor]()
@@ -160,7 +160,7 @@ def test_a_get_up_that_is_lost_is_tried_in_another_way(tracker: Tracker, task: I
     assert clips is not None
     motion = GeneratorGoal(Stands(clips.ease.double()), task.humanoid, 30.0, lead=1)
     goal = Recovering(motion, clips)
-    goal.draw(torch.zeros(1, dtype=torch.long))
+    goal.reset(torch.zeros(1, dtype=torch.long))
     goal.aim(None, None)
     lies, still = clips.ups[0][:1].clone(), torch.zeros(1, len(task.humanoid.bodies), 3)
     took = list[int]()
@@ -206,7 +206,7 @@ def test_of_several_futures_the_nearest_is_done_and_thought_over_halfway(
     points = ((1.5, 0.0), (1.5, 1.5))
     motion = GeneratorGoal(made, task.humanoid, 30.0, lead=1, steering=Steering(points))
     goal = Recovering(motion, None)
-    goal.draw(torch.zeros(1, dtype=torch.long))
+    goal.reset(torch.zeros(1, dtype=torch.long))
     goal.aim(None, None)
     assert int(motion.count) == made.past + made.future // 2
     for _ in range(75):

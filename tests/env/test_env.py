@@ -178,7 +178,7 @@ def test_observations_do_not_know_where_in_the_world(make_env):
     ref = env.reference
     qpos, qvel = carried(ref.qpos, ref.qvel)
     env.goal.clips.reference = ref.with_pose(ref.poser(qpos, qvel))
-    env.goal.clips.seek(env.clip, env.frame)
+    env.goal.clips.reset(None, env.clip, env.frame)
     env.goal.aim(None, None)
     env.backend.write(None, *carried(env.backend.state.qpos, env.backend.state.qvel))
     torch.testing.assert_close(env._observe(), before, atol=1e-4, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Forces of plug-ins: pushes at the control rate, forces at the physics rate."""
+"""Forces of events: pushes at the control rate, forces at the physics rate."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from poise.env.plugins import Plugin
+from poise.env.events import Event
 from poise.env.pushes import Pushes, Pushing
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
@@ -22,11 +22,11 @@ def task() -> Imitation:
     return build(ClipLibrary.of([swing(1.5, name="calm")]), ResidualForce(num_envs=2, expert=False))
 
 
-def pushed(task: Imitation, *plugins: object) -> Imitation:
-    return replace(task, task=replace(task.task, plugins=plugins, dones=()))
+def pushed(task: Imitation, *events: object) -> Imitation:
+    return replace(task, task=replace(task.task, events=events, dones=()))
 
 
-class Constant(Plugin):
+class Constant(Event):
     """30 N along +Y on the root, at one of the two rates."""
 
     def __init__(self) -> None:
@@ -38,12 +38,16 @@ class Constant(Plugin):
 
 
 class Held(Constant):
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         self.add(drive)
+        return False
 
 
 class Anew(Constant):
-    def push_substep(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
+        return True
+
+    def before_substep(self, drive: Drive) -> None:
         self.add(drive)
 
 
@@ -69,18 +73,18 @@ def test_a_push_is_a_change_of_momentum(task: Imitation) -> None:
     lasts = 3 / 30
     pushes = Pushes(newtons=(60.0, 60.0), every_s=(0.1, 0.1), lasts_s=lasts, bodies=(0, 2), seed=3)
     env = pushed(task, pushes).env(4, 1, False, threads=1, help_scale=0.0)
-    plugin = env.plugin(Pushing)
-    assert plugin is not None
+    event = env.event(Pushing)
+    assert event is not None
     zero = torch.zeros(4, dtype=torch.long)
     env.reset_to(zero, zero)
     qpos, qvel = env.backend.state.qpos.clone(), torch.zeros_like(env.backend.state.qvel)
     qpos[:, 2] += 10.0
     env.backend.write(None, qpos, qvel)
-    model, force = env.backend.model, torch.zeros_like(plugin.force)
+    model, force = env.backend.model, torch.zeros_like(event.force)
     acted = 0
     for _ in range(6):
-        acted += int(plugin.acting[0])
-        force = torch.where(plugin.acting[:, None], plugin.force, force)
+        acted += int(event.acting[0])
+        force = torch.where(event.acting[:, None], event.force, force)
         env.step(torch.zeros(4, env.num_actions))
     assert acted == 3 and force.norm(dim=-1).allclose(torch.tensor(60.0).double())
     mass = torch.tensor(model.body_mass)[:, None]
@@ -102,8 +106,8 @@ def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
         assert torch.equal(env.step(actions).obs, other.step(actions).obs)
     one = env.snapshot(torch.tensor([1]))
     other.restore(one)
-    plugin = other.plugin(Pushing)
-    assert plugin is not None and len(plugin.left.unique()) == 1
+    event = other.event(Pushing)
+    assert event is not None and len(event.left.unique()) == 1
     env.close()
     other.close()
 
@@ -111,10 +115,10 @@ def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
 def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> None:
     given = Pushes((100.0, 100.0), (0.1, 0.1), (0.1, 2.0), impulse_ns=20.0, share=0.5, seed=4)
     env = pushed(task, given).env(400, 1, False, threads=1)
-    plugin = env.plugin(Pushing)
-    assert plugin is not None
+    event = env.event(Pushing)
+    assert event is not None
     env.reset()
-    lasts, size = plugin.lasts / 30, plugin.force.norm(dim=-1)
+    lasts, size = event.lasts / 30, event.force.norm(dim=-1)
     assert float(lasts.min()) >= 0.1 and float(lasts.max()) <= 2.0
     # Evenly in the logarithm: half of them are shorter than the geometric mean.
     assert float((lasts < 0.447).float().mean()) == pytest.approx(0.5, abs=0.1)
@@ -122,7 +126,7 @@ def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> 
     assert size[lasts < 0.19].allclose(torch.tensor(100.0).double())
     impulse = (size * lasts)[lasts > 0.3]
     torch.testing.assert_close(impulse, torch.full_like(impulse, 20.0), rtol=0.12, atol=0.0)
-    assert float((plugin.left > 10**6).float().mean()) == pytest.approx(0.5, abs=0.1)
+    assert float((event.left > 10**6).float().mean()) == pytest.approx(0.5, abs=0.1)
     env.close()
 
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env import evaluate as recording
+from poise.env.events import Event, StepOutcome
 from poise.env.generator import GeneratorGoal
 from poise.env.goal import FADE_S, Goal, extrapolated
-from poise.env.plugins import Plugin
 from poise.env.stream import StreamGoal
 from poise.env.yielding import DisplacedGoal
 from poise.motion import ClipLibrary
@@ -81,7 +81,7 @@ def test_what_is_recorded_of_a_stream_is_what_was_read_before(
     def told(often: int) -> list[Tensor]:
         monkeypatch.setattr(recording, "OFTEN", often)
         goal, every, out = stream_of(task, 1, 2), torch.arange(2), list[Tensor]()
-        goal.draw(every)
+        goal.reset(every)
         for k in range(1, 12):
             if k % 4:
                 goal.push(task.reference.qpos[k], None if k % 3 else every[:1])
@@ -265,36 +265,36 @@ def test_goals_without_clips_say_so(task: Imitation) -> None:
 
 
 def test_plug_ins_of_a_task_are_made_for_each_environment_and_asked_together(task: Imitation) -> None:
-    class Waits(Plugin):
-        """Worlds wait in every other step; counts its steps."""
+    class Ends(Event):
+        """Cuts off every episode in every other step."""
 
         def __init__(self, goal: Goal, backend: Backend):
-            self.steps = torch.zeros(goal.num_envs, dtype=torch.long)
+            self.steps = 0
 
-        def held(self) -> Tensor:
-            return self.steps % 2 == 1
-
-        def tick(self) -> None:
+        def after_step(self) -> None:
             self.steps += 1
 
-    class Ticks(Plugin):
+        def judged(self, outcome: StepOutcome) -> None:
+            outcome.ends[2] = self.steps % 2 == 1
+
+    class Ticks(Event):
         """Is told of every step, and says nothing."""
 
         def __init__(self, goal: Goal, backend: Backend):
             self.ticks = 0
 
-        def tick(self) -> None:
+        def after_step(self) -> None:
             self.ticks += 1
 
-    own = replace(task, task=replace(task.task, plugins=(Ticks, Waits), auto_reset=False))
+    own = replace(task, task=replace(task.task, events=(Ticks, Ends), auto_reset=False))
     env, other = (own.env(1, auto_reset=False, threads=1) for _ in range(2))
     zero = torch.zeros(1, dtype=torch.long)
     env.reset_to(zero, zero)
-    for _ in range(6):
-        env.step(still(env))
-    ticks, waits = env.plugin(Ticks), env.plugin(Waits)
-    assert ticks is not None and waits is not None and ticks.ticks == 6 and int(env.frame) == 3
-    assert other.plugin(Ticks) is not ticks and other.plugin(Ticks).ticks == 0  # type: ignore[union-attr]
+    cut = [bool(env.step(still(env)).truncated) for _ in range(6)]
+    ticks, ends = env.event(Ticks), env.event(Ends)
+    assert ticks is not None and ends is not None and ticks.ticks == ends.steps == 6
+    assert cut == [True, False] * 3
+    assert other.event(Ticks) is not ticks and other.event(Ticks).ticks == 0  # type: ignore[union-attr]
     env.close()
     other.close()
 

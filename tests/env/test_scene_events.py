@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, ObsTerm
-from poise.env.events import InScene, ScenePart
 from poise.env.frame import Frame
-from poise.env.things import Move, SetDown, Switch, Throw, near
+from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, near
 from poise.motion import ClipLibrary
 from poise.papers.compliant.opponents import Teams
 from poise.recipes import ResidualForce, build
@@ -42,7 +41,7 @@ def env_in(
 ) -> ImitationEnv:
     """The characters follow the clip with nothing that ends their episodes."""
     terms = tuple(ObsTerm(f"scene {n}", seen, {"name": n}) for n in _sources(part))
-    own = replace(task.task, plugins=(part,), obs=(*task.task.obs, *terms))
+    own = replace(task.task, events=(part,), obs=(*task.task.obs, *terms))
     own = own if dones else replace(own, dones=())
     rows = sim.characters(*names)
     return replace(task, task=own).env(seed=1, auto_reset=reset, backend=rows, guard=False)
@@ -104,19 +103,19 @@ def test_a_ball_is_thrown_and_its_impulse_is_measured(task: Imitation) -> None:
     throw = Throw("ball", "anna/Chest", every_s=(0.8, 0.9), distance=1.2, seed=3)
     env = env_in(task, sim, InScene(metered=("hit",), events=(throw,)))
     start(env)
-    part = env.plugin(ScenePart)
+    part = env.event(ScenePart)
     assert part is not None
-    place, source = sim.scene.place("ball"), part.sources()
+    place, source = sim.scene.place("ball"), part.tells()
     velocity = sim.backend.state.qvel[:, place.dofs][:, :3]
     hits, dt = 0, 1 / task.config.sim.control_hz
     for _ in range(80):
-        before, thrown = velocity.clone(), part.happenings[0].rows()["thrown"].clone()
+        before, thrown = velocity.clone(), part.events[0].rows()["thrown"].clone()
         env.step(still(env))
         impulse, peak = source["impulse/hit"], source["peak/hit"]
         hit = peak > 1.0
         # Above the floor nothing else touches the ball.
         high = sim.backend.state.xpos[:, place.body, 2] > 0.3
-        same = (part.happenings[0].rows()["thrown"] == thrown) & hit & high
+        same = (part.events[0].rows()["thrown"] == thrown) & hit & high
         change = (velocity - before).float()
         change[:, 2] += 9.81 * dt
         torch.testing.assert_close(-impulse[same], change[same], rtol=0.02, atol=0.05)
@@ -275,7 +274,7 @@ def test_mistakes(task: Imitation) -> None:
         env_in(task, sim, InScene(sees=("others",)))
     with refused("out-of-range", says="speed"):
         Throw("ball", "anna/Chest", speed=(3.0, 2.0))
-    part = replace(task.task, plugins=(InScene(),))
+    part = replace(task.task, events=(InScene(),))
     with refused("scene-needed"):
         replace(task, task=part).env(1, threads=1)
     sim.close()

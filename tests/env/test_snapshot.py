@@ -15,10 +15,10 @@ from poise.env.recovery.recovering import Recovering
 from poise.env.yielding import DisplacedGoal
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build as build_perpetual
 from poise.recipes.perpetual import stage_task
-from poise.recipes.shapes import BodyShapes
 from refusals import refused
 from toy_human import swing
 from toy_library import PLAIN, library, lively, tiny

@@ -11,9 +11,8 @@ import torch
 
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
-from poise.env.events import InScene, touches_of
 from poise.env.pushes import Pushes
-from poise.env.things import SetDown
+from poise.env.scene import InScene, SetDown, touches_of
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.learn import PPOConfig
 from poise.motion import ClipLibrary
@@ -38,7 +37,7 @@ def hand(task: Imitation) -> int:
 
 def yielding(task: Imitation, given: Compliance | Stiffness | None, worlds: int = 3) -> ImitationEnv:
     pushes = replace(PUSH, bodies=(hand(task),))
-    own = replace(task.task, plugins=(pushes,), compliance=given, dones=(), help=None)
+    own = replace(task.task, events=(pushes,), compliance=given, dones=(), help=None)
     return replace(task, task=own).env(worlds, 1, False, threads=1, help_scale=0.0)
 
 
@@ -49,7 +48,7 @@ def begun(env: ImitationEnv) -> ImitationEnv:
 
 
 def part(env: ImitationEnv) -> Yielding:
-    found = env.plugin(Yielding)
+    found = env.event(Yielding)
     assert found is not None and isinstance(env.goal, DisplacedGoal)
     return found
 
@@ -61,22 +60,22 @@ def still(env: ImitationEnv) -> torch.Tensor:
 @pytest.mark.parametrize("law", ["eq8", "algorithm1"])
 def test_u_is_that_of_a_naive_twin_in_every_physics_step(task: Imitation, law: str) -> None:
     env = begun(yielding(task, Compliance(level=0.3, law=law)))  # type: ignore[arg-type]
-    plugin, goal, model = part(env), env.goal, env.backend.model
+    event, goal, model = part(env), env.goal, env.backend.model
     assert isinstance(goal, DisplacedGoal)
     body, h, seen = hand(task) + 1, float(model.opt.timestep), 0
-    weights = plugin._weights.numpy()
-    move = plugin._move
+    weights = event._weights.numpy()
+    move = event._move
 
     def watched(felt: list) -> None:  # type: ignore[type-arg]
         nonlocal seen
         before, rate = goal.offset.clone().numpy(), goal.rate.clone().numpy()
         want, moves = before.copy(), []
         refs = [goal.goal.layout.unpacked(p) for p in (goal.goal.now(), goal.goal.ahead())]
-        at = plugin._k / plugin._substeps
+        at = event._k / event._substeps
         for n in range(env.num_envs):
             force = felt[0].force[n, 0].numpy()
             if np.linalg.norm(force) < 1.0:
-                w = 2 * np.pi * plugin.given.return_hz
+                w = 2 * np.pi * event.given.return_hz
                 slope = rate[n] + w * before[n]
                 want[n] = np.exp(-w * h) * (before[n] + slope * h)
                 continue
@@ -107,13 +106,13 @@ def test_u_is_that_of_a_naive_twin_in_every_physics_step(task: Imitation, law: s
             want[n] = before[n] + h * 0.3 * w @ jac.T @ inverse @ velocity
             moves.append(n)
         move(felt)
-        free = plugin.share.numpy() == 1.0
+        free = event.share.numpy() == 1.0
         for n in range(env.num_envs):
             if free[n] or n not in moves:
                 np.testing.assert_allclose(goal.offset[n].numpy(), want[n], atol=1e-9, rtol=0)
                 seen += n in moves
 
-    plugin._move = watched  # type: ignore[method-assign]
+    event._move = watched  # type: ignore[method-assign]
     for _ in range(8):
         env.step(still(env))
     assert seen > 20 and float(goal.offset.abs().max()) > 1e-3
@@ -174,16 +173,16 @@ def test_copies_of_a_world_yield_alike(task: Imitation, given: Compliance | Stif
 @pytest.mark.parametrize("given", [Compliance(level=1.0, root=False), Stiffness(20.0)])
 def test_the_range_of_motion_holds_by_itself(task: Imitation, given: Compliance | Stiffness) -> None:
     own = replace(PUSH, newtons=(300.0, 300.0), lasts_s=3.0, bodies=(hand(task),))
-    made = replace(task.task, plugins=(own,), compliance=given, dones=(), help=None)
+    made = replace(task.task, events=(own,), compliance=given, dones=(), help=None)
     env = begun(replace(task, task=made).env(3, 1, False, threads=1, help_scale=0.0, guard=False))
-    plugin, lowered = part(env), False
+    event, lowered = part(env), False
     low, high = torch.from_numpy(env.backend.model.jnt_range[1:]).unbind(1)
     for _ in range(30):
         env.step(still(env))
         # Nothing is added to the goal's angles by the actions.
         hinges = env.backend.drive.ctrl
         assert (hinges <= high + 1e-9).all() and (hinges >= low - 1e-9).all()
-        lowered |= bool((plugin.share < 1.0).any())
+        lowered |= bool((event.share < 1.0).any())
     assert lowered
     env.close()
 
@@ -191,9 +190,9 @@ def test_the_range_of_motion_holds_by_itself(task: Imitation, given: Compliance 
 def test_a_goal_yields_along_the_force_and_comes_back(task: Imitation) -> None:
     """Pushed for 0.5 s; after that the goal is where it was."""
     pushes = replace(PUSH, every_s=(0.1, 0.1), bodies=(hand(task),), seed=1)
-    own = replace(task.task, plugins=(pushes,), compliance=Stiffness(100.0), dones=(), help=None)
+    own = replace(task.task, events=(pushes,), compliance=Stiffness(100.0), dones=(), help=None)
     env = begun(replace(task, task=own).env(2, 1, False, threads=1, help_scale=0.0))
-    push = env.plugins[-2]
+    push = env.events[-2]
     most = torch.zeros(2, dtype=torch.float64)
     for _ in range(18):
         env.step(still(env))
@@ -229,7 +228,7 @@ def test_contacts_and_links_are_felt(task: Imitation) -> None:
     names = tuple(t.name for t in scene.touches[:-1])
     ball = SetDown("ball", (0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0))
     given = InScene(touches=("all",), felt=(*names, "grip"), events=(ball,))
-    own = replace(task.task, plugins=(given,), compliance=Compliance(), dones=(), help=None)
+    own = replace(task.task, events=(given,), compliance=Compliance(), dones=(), help=None)
     env = replace(task, task=own).env(backend=sim.characters(), auto_reset=False, help_scale=0.0)
     begun(env)
     head = env.pose().pos[:, :, 2].argmax(1)[0]
@@ -238,7 +237,7 @@ def test_contacts_and_links_are_felt(task: Imitation) -> None:
     down = torch.zeros(2, 6).double()
     down[:, 2] = -3.0
     sim.place("ball", qpos, down)
-    scene_part, hits = env.plugins[-2], 0
+    scene_part, hits = env.events[-2], 0
     for _ in range(20):
         env.step(still(env))
         felt = scene_part.felt()
@@ -267,7 +266,7 @@ def test_two_characters_of_one_world_yield_for_themselves(task: Imitation) -> No
     both = (Character(task.humanoid, "anna"), Character(task.humanoid, "ben"))
     sim = SceneSim(Scene(both, sim=task.config.sim), 2, threads=1)
     pushes = replace(PUSH, bodies=(hand(task),))
-    own = replace(task.task, plugins=(pushes,), compliance=Compliance(), dones=(), help=None)
+    own = replace(task.task, events=(pushes,), compliance=Compliance(), dones=(), help=None)
     env = replace(task, task=own).env(1, auto_reset=False, backend=sim.characters(), help_scale=0.0)
     alone = replace(task, task=own).env(4, 1, False, threads=1, help_scale=0.0)
     zero = torch.zeros(4, dtype=torch.long)
@@ -311,7 +310,7 @@ def test_the_dial_is_checked(task: Imitation) -> None:
 )
 def test_what_cannot_be_felt(task: Imitation, felt: tuple[str, ...], what: tuple) -> None:
     sim = SceneSim(scene_of(task), 1, threads=1)
-    own = replace(task.task, plugins=(InScene(felt=felt),), compliance=Compliance())
+    own = replace(task.task, events=(InScene(felt=felt),), compliance=Compliance())
     with refused(*what):
         replace(task, task=own).env(backend=sim.characters())
     sim.close()
@@ -325,13 +324,13 @@ def test_in_hindsight_the_goal_that_is_seen_lies_beyond_what_is_to_be_reached(ta
         own = replace(
             PUSH, newtons=(20.0, 20.0), every_s=(0.05, 0.05), lasts_s=3.0, bodies=(hand(task),)
         )
-        made = replace(task.task, plugins=(own,), compliance=given, dones=(), help=None)
+        made = replace(task.task, events=(own,), compliance=given, dones=(), help=None)
         env = begun(replace(task, task=made).env(2, 1, False, threads=1, help_scale=0.0))
         for _ in range(10):
             env.step(still(env))
         goal, place, row = env.goal, env.goal.layout.unpacked, hand(task)
         assert isinstance(goal, DisplacedGoal)
-        felt = env.plugins[-2].felt()
+        felt = env.events[-2].felt()
         assert felt is not None
         now, ahead = (
             (place(a).pos - place(b).pos)[:, row].double()
@@ -353,7 +352,7 @@ def test_in_hindsight_the_goal_that_is_seen_lies_beyond_what_is_to_be_reached(ta
 def test_a_tracker_is_trained_in_hindsight_the_same_every_time(task: Imitation) -> None:
     ppo = PPOConfig(horizon=8, epochs=2, minibatch=16, policy_hidden=(16,), value_hidden=(16,))
     pushes = replace(PUSH, newtons=(5.0, 20.0), every_s=(0.05, 0.2), bodies=(hand(task),))
-    own = replace(task.task, plugins=(pushes,), compliance=Stiffness(300.0, hindsight=True))
+    own = replace(task.task, events=(pushes,), compliance=Stiffness(300.0, hindsight=True))
     rows, offset = list[list[float]](), torch.zeros(1)
     for _ in range(2):
         trainer = replace(task, task=own).trainer(threads=1, ppo=ppo)

@@ -11,18 +11,18 @@ import torch
 from poise.env.recovery.clips import CALM, QUICK
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
-from poise.jobs.perpetual.run import begin, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.perpetual.stages import Progress, Stage, demonstrations, odds, practised, staged
-from poise.jobs.track import TrackConfig, track
+from poise.jobs.track import TrackConfig, recovering, track
 from poise.jobs.track.learning import learn
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
 from poise.learn.composer import Composer
 from poise.papers.perpetual.ablations import StagedPerpetual, going_on
 from poise.papers.perpetual.primitive_stages import Owners
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build, standing
 from poise.recipes.perpetual_settings import WIDE
-from poise.recipes.shapes import BodyShapes
 from refusals import refused
 from toy_human import swing
 from toy_library import PLAIN, Scripted, library, lively, tiny
@@ -223,14 +223,18 @@ def test_a_policy_that_goes_on_learns_to_be_quick(tracker: Tracker) -> None:
     assert going_on(config, replace(tiny(recovery=True), single=True)).recovering.quick
 
 
-def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:
+def test_a_motion_that_is_lost_goes_on_where_it_waits(
+    tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With a policy that hardly stands, so that it is lost; what comes out holds together."""
+    # It is waited for a short while.
+    monkeypatch.setattr(recovering, "AWAY_S", 1.0)
     config = TrackConfig(recover=True, controller="policy")
+    clip = swing(1.2, name="long")
     with refused("recovery-not-learned", says="come back"):
-        track(swing(4.0, name="long"), tracker, config)
+        track(clip, tracker, config)
     made = build(lively(), tiny(recovery=True, **PLAIN))
     able = replace(tracker, recovery_clips=made.recovery_clips)
-    clip = swing(4.0, name="long")
     done = track(clip, able, config)
     again = track(clip, able, config)
     assert (done.evaluation.recordings[0].qpos == again.evaluation.recordings[0].qpos).all()

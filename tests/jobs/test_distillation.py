@@ -10,12 +10,12 @@ import torch
 
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.distillation import PolicyTeacher, distilled, taught_by
-from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.tracker import Tracker
 from poise.learn import Until
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import Perpetual
-from poise.recipes.shapes import BodyShapes
 from refusals import refused
 from toy_library import PLAIN, library, tiny
 

@@ -16,8 +16,8 @@ from poise.formats import read_clip
 from poise.jobs.endless import dreamt as frames
 from poise.jobs.endless.dreaming import begun, dream, past_of
 from poise.jobs.endless.dreamt import NUMBER, ClipMaker, Dream, FrameStore, MotionWriter, Pieces
+from poise.jobs.endless.endless_training import Endless, motions_of, train_generator
 from poise.jobs.endless.model import GeneratorModel
-from poise.jobs.endless.training import Endless, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker

@@ -10,8 +10,8 @@ import pytest
 
 from poise.cli.main import main
 from poise.formats import read_clip, write_bvh
-from poise.jobs.inbetween.settings import small
-from poise.jobs.inbetween.training import (
+from poise.jobs.inbetween.inbetween_settings import small
+from poise.jobs.inbetween.inbetween_training import (
     FRAMES,
     Inbetween,
     begin,
@@ -23,7 +23,7 @@ from poise.jobs.inbetween.training import (
 )
 from poise.jobs.run_file import RUN_FILE
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.inbetween import load_model, save_model
+from poise.learn.inbetween_model import load_model, save_model
 from refusals import refused
 from toy_human import swing
 
@@ -64,7 +64,7 @@ def test_a_library_is_read_once(library: Path, tmp_path: Path, monkeypatch: pyte
     cache = tmp_path / "bank.safetensors"
     first, _ = library_bank(library, cache)
     reads: list[Path] = []
-    monkeypatch.setattr("poise.jobs.inbetween.training.read_clip", lambda p: reads.append(p))
+    monkeypatch.setattr("poise.jobs.inbetween.inbetween_training.read_clip", lambda p: reads.append(p))
     again, _ = library_bank(library, cache)
     assert reads == [] and again.clips == first.clips and bool((again.rot == first.rot).all())
     assert again.facing == first.facing and again.feet == first.feet

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from poise.jobs.endless.endless_training import Endless, motions_of, train_generator
 from poise.jobs.endless.model import (
     GeneratorModel,
     clips_of_seeds,
@@ -15,7 +16,6 @@ from poise.jobs.endless.model import (
     names_of,
     read_labels,
 )
-from poise.jobs.endless.training import Endless, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.cvae import CVAEConfig, CVAETraining

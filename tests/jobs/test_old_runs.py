@@ -19,7 +19,7 @@ import torch
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips, try_recovery
 from poise.jobs.runs import evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, imitation_of, track

@@ -12,7 +12,7 @@ import torch
 from poise.body import BodyConfig
 from poise.env.yielding import Yielding
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.jobs.warm_start import widened
@@ -153,13 +153,13 @@ def test_a_policy_goes_on_while_it_is_pushed_and_sees_its_goal_give_way(
     task = wider(tracker, pushes=plan)
     start = widened(tracker, task)
     # Evaluations are without pushes, so that nothing gives way.
-    assert task.task.compliance is None and not task.task.plugins
+    assert task.task.compliance is None and not task.task.events
     env = task.env(3, threads=1, auto_reset=False)
-    columns = env.obs_widths["yielding"]
-    assert columns == 4 + len(task.humanoid.hinges)
+    columns = env.columns["yielding"]
+    assert columns.stop - columns.start == 4 + len(task.humanoid.hinges)
     zero = torch.zeros(3, dtype=torch.long)
     obs = env.reset_to(zero, zero)
-    assert not obs[:, -columns:].any()
+    assert not obs[:, columns].any()
     env.close()
     # In training some is measured and seen: levels as they were drawn, and the displaced goal.
     assert float(start.policy.norm.std[-columns]) > 0.01
@@ -167,7 +167,7 @@ def test_a_policy_goes_on_while_it_is_pushed_and_sees_its_goal_give_way(
     stages = StageTrainer(write, tmp_path, Until(iterations=1), 1, tensorboard=False, trained=start)
     stages.iterate()
     env = stages.trainer.env
-    yielding = env.plugin(Yielding)
+    yielding = env.event(Yielding)
     assert (
         yielding is not None and 0.1 <= float(yielding.level.min()) < float(yielding.level.max()) <= 0.2
     )

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from poise.control import SuccessHelp
-from poise.jobs.perpetual import run as result
+from poise.jobs.perpetual import perpetual_run as result
 from poise.jobs.perpetual import stage_trainer as stage_evaluation
 from poise.jobs.perpetual.evaluation import StageRecord, evaluate_clips, mean_help
-from poise.jobs.perpetual.run import begin
+from poise.jobs.perpetual.perpetual_run import begin
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
 from poise.recipes.imitation import Imitation

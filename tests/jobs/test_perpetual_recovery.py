@@ -16,7 +16,7 @@ from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import evaluation as perpetual_recovery
 from poise.jobs.perpetual.evaluation import RECOVERY_WORTH, StageRecord, back, check_falls, try_recovery
-from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.perpetual.stages import Progress, Stage, staged
 from poise.jobs.run_file import FINAL, RUN_FILE
 from poise.learn import Until, compose, first_column, load_checkpoint, load_policy, next_column
@@ -75,7 +75,7 @@ def test_all_stages_see_as_much_and_near_the_reference_the_same(built: Imitation
     for stage in STAGES:
         env = staged(built, stage).env(4, auto_reset=False, threads=1)
         seen.append(env.reset_to(clip, frame).clone())
-        assert (env.plugin(RecoveryClock) is None) == (stage.recovers is None)
+        assert (env.event(RecoveryClock) is None) == (stage.recovers is None)
         assert env.task.recovery is None or env.task.recovery.drop.count == 4
         env.close()
     assert torch.equal(seen[0], seen[1]) and torch.equal(seen[0], seen[2])

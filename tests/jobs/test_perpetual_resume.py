@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.jobs.perpetual.run import begin, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.perpetual.stages import Progress, Stage
 from poise.jobs.run_file import FINAL

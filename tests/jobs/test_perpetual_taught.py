@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import begin, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.warm_start import widened
 from poise.learn import LATEST, LessonConfig, Until, load_checkpoint
 from poise.papers.perpetual.ablations import going_on

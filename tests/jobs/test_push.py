@@ -83,7 +83,7 @@ def test_lookahead_knows_of_no_push_to_come(task: Imitation) -> None:
     zero = torch.zeros(1, dtype=torch.long)
     env.reset_to(zero, zero)
     still = torch.zeros(1, env.num_actions)
-    ahead = copies.plugin(OnePush)
+    ahead = copies.event(OnePush)
     assert ahead is not None
     felt = []
     for _ in range(10):
@@ -159,7 +159,7 @@ def test_what_cannot_be_pushed(task: Imitation, tracker: Tracker) -> None:
     with refused("single-clip-only", says="a push"):
         track([WALK, WALK], tracker, push=PushConfig())
     with refused("index-outside", says="90"):
-        own = replace(task.task, plugins=(Push(90, (1.0, 0.0, 0.0), 0, 1),))
+        own = replace(task.task, events=(Push(90, (1.0, 0.0, 0.0), 0, 1),))
         replace(task, task=own).env(1)
     assert with_push(task, None) is task
     assert isinstance(PushConfig(stiffness=50.0).yields, Stiffness)

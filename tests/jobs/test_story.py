@@ -14,7 +14,7 @@ from test_best import episodes
 from poise.jobs.result import Merit, merit, story
 from poise.jobs.track import controllers
 from poise.jobs.track.controllers import TrackingRun, done_by
-from poise.jobs.track.settings import TrackConfig
+from poise.jobs.track_settings import TrackConfig
 from poise.metrics import success_rule
 from poise.plan import SamplingResult
 from poise.score import score_rollouts

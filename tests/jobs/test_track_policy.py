@@ -124,7 +124,7 @@ def test_a_run_that_knows_one_clip_only(tmp_path: Path) -> None:
 
 
 def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
-    from poise.jobs.perpetual import run as perpetual_run
+    from poise.jobs.perpetual import perpetual_run
     from poise.motion import ClipLibrary
 
     config = replace(tracker.config, seed=3)

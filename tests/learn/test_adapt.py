@@ -9,8 +9,8 @@ import torch
 
 from poise.errors import PoiseError
 from poise.learn.between import Between
-from poise.learn.inbetween import Adaptation, adapt, contact_loss, make_net, smoothness_loss
-from poise.learn.inbetween import test_loss as eq4
+from poise.learn.inbetween_model import Adaptation, adapt, contact_loss, make_net, smoothness_loss
+from poise.learn.inbetween_model import test_loss as eq4
 from poise.papers.skeleton2humanoid.rtn import RTN
 from toy_windows import SMALL, SMALL_RTN, bank, known, layout
 

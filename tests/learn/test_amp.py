@@ -12,7 +12,7 @@ from toy_style_env import FRAMES, StyleEnv, to_the_right
 
 from poise.learn import Amp, AmpConfig, PPOConfig, Trainer
 from poise.learn.amp import LEAST, Discriminator, adversarial_loss, gradient_penalty, style_reward
-from poise.learn.windows import History, WindowBuffer
+from poise.learn.window_sampler import History, WindowBuffer
 from refusals import refused
 
 PPO = PPOConfig(std=0.3, horizon=12, epochs=2, policy_hidden=(16,), value_hidden=(16,), minibatch=128)

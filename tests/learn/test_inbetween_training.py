@@ -10,7 +10,7 @@ import torch
 
 from poise.learn.between import BetweenObjective, BetweenTraining, schedule
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.inbetween import (
+from poise.learn.inbetween_model import (
     InbetweenModel,
     InbetweenTrainer,
     load_model,
@@ -18,7 +18,7 @@ from poise.learn.inbetween import (
     save_model,
     train_inbetween,
 )
-from poise.learn.windows import Sampler
+from poise.learn.window_sampler import Sampler
 from poise.papers.skeleton2humanoid.rtn import RTNObjective, RTNTraining
 from refusals import refused
 from toy_windows import SMALL, SMALL_RTN, bank, data

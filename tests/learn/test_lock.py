@@ -13,7 +13,7 @@ from test_inbetween_training import trainer
 from poise.errors import PoiseError
 from poise.learn import checkpoint as lock
 from poise.learn.checkpoint import only_writer
-from poise.learn.inbetween import train_inbetween
+from poise.learn.inbetween_model import train_inbetween
 from refusals import refused
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="folders cannot be locked there")

@@ -270,11 +270,11 @@ def test_ppo_solves_the_toy_task_and_the_seed_decides_the_numbers():
     rewards = [[s.reward for s in run] for run in runs]
     assert rewards[0] == rewards[1] != rewards[2]
 
-    trainer = Trainer(PointEnv(128), TOY, seed=1)
+    trainer = Trainer(PointEnv(64), TOY, seed=1)
     stats = [trainer.iterate() for _ in range(60)]
     assert stats[0].reward < 0.5 and stats[-1].reward > 0.85
     last = stats[-1]
-    assert last.samples == 60 * 16 * 128 and last.iteration == 60
+    assert last.samples == 60 * 16 * 64 and last.iteration == 60
     assert last.episode_length == LIMIT and last.failure_rate == 0.0
     assert last.episode_reward == pytest.approx(last.episode_length * last.reward, rel=0.15)
     assert set(last.terms) == {"distance"}

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from majority import majority
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
@@ -55,38 +56,41 @@ class Played:
 
 
 def test_a_character_follows_is_knocked_over_and_gets_up(tracker: Tracker, walk: Clip) -> None:
-    played = Played(tracker, walk, LiveConfig(seed=1))
-    character = played.live.world.characters[0]
-    played.run(2.0)
-    assert character.doing == TRACKS and played.live.world.body(0).off_m < 0.3
-    # Not every blow fells it: some it comes back from on its feet.
-    for knock in range(1, 7):
-        before = played.live.world.rows.state.qpos[0, :3].clone()
-        played.live.commands.append({"type": "knock", "character": 0})
-        played.run(1.0)
-        assert character.doing in (FALLS, RETURNS) and character.lost == knock
-        for _ in range(20):
-            played.run(0.5)
-            if character.doing == TRACKS and played.live.world.body(0).off_m < 0.3:
+    def check(seed: int) -> None:
+        played = Played(tracker, walk, LiveConfig(seed=seed))
+        character = played.live.world.characters[0]
+        played.run(2.0)
+        assert character.doing == TRACKS and played.live.world.body(0).off_m < 0.3
+        # Not every blow fells it: some it comes back from on its feet.
+        for knock in range(1, 7):
+            before = played.live.world.rows.state.qpos[0, :3].clone()
+            played.live.commands.append({"type": "knock", "character": 0})
+            played.run(1.0)
+            assert character.doing in (FALLS, RETURNS) and character.lost == knock
+            for _ in range(20):
+                played.run(0.5)
+                if character.doing == TRACKS and played.live.world.body(0).off_m < 0.3:
+                    break
+            assert character.doing == TRACKS and character.recovered >= knock
+            # It goes on from where it got up.
+            assert float((played.live.world.rows.state.qpos[0, :2] - before[:2]).norm()) < 6.0
+            if character.falls:
                 break
-        assert character.doing == TRACKS and character.recovered >= knock
-        # It goes on from where it got up.
-        assert float((played.live.world.rows.state.qpos[0, :2] - before[:2]).norm()) < 6.0
-        if character.falls:
-            break
-    told = played.live.figures()
-    assert told["help_n"] == 0.0 and told["characters"][0]["falls"] >= 1
-    played.live.close()
+        told = played.live.figures()
+        assert told["help_n"] == 0.0 and told["characters"][0]["falls"] >= 1
+        played.live.close()
+
+    majority(check)
 
 
 def test_who_goes_away_is_waited_for_at_ease(tracker: Tracker, walk: Clip) -> None:
     played = Played(tracker, walk, LiveConfig(buffer_s=0.2))
     character = played.live.world.characters[0]
-    played.run(1.5)
-    played.run(3.0, sends=False)
+    played.run(1.0)
+    played.run(2.5, sends=False)
     assert character.doing == EASE and character.falls == 0
     assert played.live.world.body(0).off_m < 0.2
-    played.run(1.5)
+    played.run(1.2)
     assert character.doing == TRACKS
     played.live.close()
 

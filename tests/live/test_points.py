@@ -20,10 +20,11 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics.retarget.passage import world_of
 from poise.live.characters import TRACKS
+from poise.live.points import PointFit
 from poise.live.protocol import LiveConfig
 from poise.live.session import Live
 from poise.live.sockets import StreamDoor
-from poise.live.sources import JsonStream, KeypointFrame, PointFit
+from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
 from poise.motion import quats as q
@@ -297,7 +298,7 @@ def test_a_stream_goal_takes_places(tracker: Tracker) -> None:
     assert tracker.recovery_clips is not None
     ease, bodies = tracker.recovery_clips.ease, len(tracker.humanoid.bodies)
     goal.push(ease)
-    goal.draw(torch.arange(2))
+    goal.reset(torch.arange(2))
     places = torch.full((2, bodies, 3), torch.nan)
     places[1] = torch.randn(bodies, 3, generator=torch.Generator().manual_seed(0))
     goal.push(ease.expand(2, -1), places=places)

@@ -58,7 +58,7 @@ def test_commands_and_reasons_are_all_on_the_page() -> None:
     for kind, fields in COMMANDS.items():
         assert f"`{kind}`" in PAGE, kind
         assert all(f"`{name}`" in PAGE for name in fields), kind
-    rooms = ("protocol.py", "stream.py", "sources.py", "sockets.py")
+    rooms = ("protocol.py", "stream.py", "points.py", "sources.py", "sockets.py")
     for room in rooms:
         text = (ROOT / "src/poise/live" / room).read_text(encoding="utf-8")
         said = re.findall(r'(?:PoiseError\(|refuse\(|return )"([a-z][a-zA-Z -]+)"', text)

@@ -10,9 +10,10 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics.retarget.passage import world_of
 from poise.kinematics.stream_noise import LATE_S
-from poise.live.people import Person
+from poise.live.people import Person, Steady
+from poise.live.points import PointFit
 from poise.live.session import _of_tremble
-from poise.live.sources import KeypointFrame, Loop, PointFit
+from poise.live.sources import KeypointFrame, Loop
 from poise.live.stream import Inbox, JitterBuffer, Packet, StreamTremble, margin
 from poise.motion import Clip, Skeleton
 from poise.motion import quats as q
@@ -63,7 +64,7 @@ def off_mm(root: np.ndarray, rot: np.ndarray, truth: Packet) -> float:
 
 def through(packets: list[Packet], at_once: int = 1) -> Person:
     """Who has got these packets, so many at once."""
-    inbox, person = Inbox(steady=True), Person(packets[0].person, 0.1)
+    inbox, person = Inbox(Steady), Person(packets[0].person, 0.1)
     for k, packet in enumerate(packets):
         assert inbox.offer(packet, packet.time_s)
         if k % at_once == at_once - 1 or k == len(packets) - 1:
@@ -73,7 +74,7 @@ def through(packets: list[Packet], at_once: int = 1) -> Person:
 
 
 def test_a_clean_stream_is_left_alone_and_no_later(walk: Clip) -> None:
-    packets, inbox = stream(walk, 8.0, 0.0), Inbox(steady=True)
+    packets, inbox = stream(walk, 8.0, 0.0), Inbox(Steady)
     for packet in packets:
         inbox.offer(packet, packet.time_s)
         ((_, came),) = inbox.take()["a"]
@@ -86,7 +87,7 @@ def test_a_clean_stream_is_left_alone_and_no_later(walk: Clip) -> None:
 @pytest.mark.parametrize(("hz", "left"), [(0.0, 0.62), (5.0, 0.35)])
 def test_a_trembling_stream_is_smoothed_a_step_later(walk: Clip, hz: float, left: float) -> None:
     truth, dirty = stream(walk, 9.0, 0.0), stream(walk, 9.0, 0.03, hz)
-    inbox, known, raw, came = Inbox(steady=True), list[float](), list[float](), dirty[0]
+    inbox, known, raw, came = Inbox(Steady), list[float](), list[float](), dirty[0]
     for k, packet in enumerate(dirty):
         inbox.offer(packet, packet.time_s)
         ((_, came),) = inbox.take()["a"]
@@ -127,7 +128,7 @@ def test_packets_at_once_make_no_difference(walk: Clip) -> None:
         np.testing.assert_array_equal(a.root_pos, b.root_pos)
         np.testing.assert_array_equal(a.rot, b.rot)
     # Nor do packets that come late, which are left out, or twice.
-    inbox, person = Inbox(steady=True), Person("a", 0.1)
+    inbox, person = Inbox(Steady), Person("a", 0.1)
     for k, packet in enumerate(dirty):
         inbox.offer(packet, packet.time_s)
         inbox.offer(dirty[max(k - 2, 0)], packet.time_s)
@@ -193,7 +194,7 @@ def test_keypoints_are_smoothed_before_a_body_is_fitted(tracker: Tracker, walk: 
 
 def test_refused_packets_leave_the_filter_alone(walk: Clip) -> None:
     dirty = stream(walk, 3.0, 0.03)
-    inbox, person, bad = Inbox(steady=True), Person("a", 0.1), dirty[40].rot.copy()
+    inbox, person, bad = Inbox(Steady), Person("a", 0.1), dirty[40].rot.copy()
     bad[3] = np.nan
     for packet in dirty:
         assert inbox.offer(packet, packet.time_s)

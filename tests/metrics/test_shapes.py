@@ -168,5 +168,5 @@ def test_long_motions_are_placed_in_pieces(monkeypatch):
         lambda p, q: centre_of_mass(p, q, body),
     ]
     whole = [figure(pos, quat) for figure in figures]
-    monkeypatch.setattr("poise.metrics.shapes.PIECE", 7)
+    monkeypatch.setattr("poise.metrics.shape_points.PIECE", 7)
     assert all(torch.equal(figure(pos, quat), want) for figure, want in zip(figures, whole, strict=True))

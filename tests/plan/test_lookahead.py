@@ -14,7 +14,7 @@ from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.metrics.shapes import BOX, Shapes
+from poise.metrics.shape_points import BOX, Shapes
 from poise.plan import Lookahead, LookaheadConfig
 from poise.plan.lookahead import CALM, Roughness
 from poise.recipes.imitation import Imitation

@@ -9,13 +9,13 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.perpetual.run import begin, resume, train
+from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.learn import PolicyBundle, Until
 from poise.motion.noise import VIDEO, perturb_clip, scaled
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import Perpetual
-from poise.recipes.shapes import BodyShapes
 from refusals import refused
 from toy_library import PLAIN, library, tiny
 

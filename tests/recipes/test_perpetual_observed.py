@@ -136,7 +136,7 @@ def test_what_acts_is_filtered_and_observed_and_the_first_action_is_taken_as_it_
     env = an_env(filter=0.75)
     env.reset_to(HERE, HERE)
     given, last = actions(env), None
-    where = sum(w for n, w in list(env.obs_widths.items())[:2])
+    where = env.columns["last_action"].start
     for u in given:
         before = u.clone()
         obs = env.step(u).final_obs
@@ -258,7 +258,8 @@ def test_what_smooth_policies_do_not_answer_to_are_the_goals_velocities(goal: st
     imitation = built(**given)
     env = imitation.env(4, threads=1, auto_reset=False)
     env.reset()
-    frame, (first, last) = env._frame(), imitation.task.velocities or (0, 0)
+    frame, parts = env._frame(), [env.columns[name] for name in imitation.task.velocities]
+    first, last = parts[0].start, parts[-1].stop
     before = seen_by(imitation.task.obs, frame)
     frame.ahead.linvel.add_(1.0)
     frame.ahead.angvel.add_(1.0)

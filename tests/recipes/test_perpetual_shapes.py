@@ -11,7 +11,7 @@ import torch
 
 from poise.body import make_humanoid
 from poise.env import observations as obs
-from poise.env.plugins import BodyAssignment
+from poise.env.events import BodyAssignment
 from poise.env.reference import differing
 from poise.formats import read_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
@@ -19,10 +19,10 @@ from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.kinematics import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary, resample
+from poise.recipes.body_shapes import GROUPS, BodyShapes, scaled_skeleton, scaled_table, shaped
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build, task
 from poise.recipes.perpetual_settings import Perpetual
-from poise.recipes.shapes import GROUPS, BodyShapes, scaled_skeleton, scaled_table, shaped
 from poise.sim import CpuBackend, alone
 from refusals import refused
 from toy_library import library, tiny
@@ -145,7 +145,7 @@ def test_worlds_change_bodies_when_episodes_begin(imitation: Imitation) -> None:
         env.step(torch.zeros(16, env.num_actions))
         body = imitation.reference.body[env.clip]
         worn |= set(body.tolist())
-        bodies = env.plugin(BodyAssignment)
+        bodies = env.event(BodyAssignment)
         assert bodies is not None and torch.equal(bodies.body, body)
         mass = env.backend.expand("body_mass").sum(1)
         own = torch.tensor([h.mass for h in imitation.reference.bodies], dtype=torch.float64)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from poise.env.generator import GeneratorGoal
+from poise.jobs.endless.endless_training import Endless, balanced, motions_of, train_generator
 from poise.jobs.endless.model import GeneratorModel, Motions, load_generator
-from poise.jobs.endless.training import Endless, balanced, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
@@ -179,7 +179,7 @@ def test_it_is_saved_and_drives_a_goal(
     torch.testing.assert_close(one, two, atol=1e-4, rtol=0)
     assert one.shape == (40, tracker.humanoid.model.nq) and bool(one.isfinite().all())
     goal = GeneratorGoal(again.generator(tracker.humanoid), tracker.humanoid, 30.0, 2, seed=7)
-    goal.draw(torch.arange(2))
+    goal.reset(torch.arange(2))
     goal.aim(None, None)
     for _ in range(20):
         goal.advance(None, None)

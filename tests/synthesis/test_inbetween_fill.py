@@ -11,7 +11,7 @@ import torch
 
 from poise.formats.own import pack_clips, unpack_clips
 from poise.learn.between import Between
-from poise.learn.inbetween import Adaptation, InbetweenModel, load_model, make_net, save_model
+from poise.learn.inbetween_model import Adaptation, InbetweenModel, load_model, make_net, save_model
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import quat_conj, quat_distance, quat_mul
 from poise.synthesis.filler import Filling, OtherRig

@@ -7,7 +7,7 @@ import torch
 from test_inbetween_fill import model
 
 from poise.learn.between import Between
-from poise.learn.inbetween import make_net
+from poise.learn.inbetween_model import make_net
 from poise.motion.windows import FrameBank
 from poise.synthesis.filler import ASIDE_M, TURNED, Detour, Filling, drawn, through
 from poise.synthesis.inbetween import fill_keyframes

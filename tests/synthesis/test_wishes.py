@@ -66,7 +66,7 @@ def test_wishes_are_in_snapshots_and_the_same_by_seed() -> None:
 
     def goal() -> GeneratorGoal:
         one = GeneratorGoal(made.wishing(10.0, 2), tracker.humanoid, 30.0, 2, seed=3, lead=40)
-        one.draw(torch.arange(2))
+        one.reset(torch.arange(2))
         one.aim(None, None)
         return one
 

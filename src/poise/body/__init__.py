@@ -1,10 +1,10 @@
 """From a skeleton to a MuJoCo humanoid: parts, parameters, model."""
 
+from poise.body.body_table import BodyRow, BodyTable, Geom
 from poise.body.generate import BodyConfig, generate_table
 from poise.body.humanoid import Humanoid, make_humanoid, make_spec
 from poise.body.mjcf import MjcfBody, read_mjcf
 from poise.body.parts import Anatomy, Part, find_anatomy
-from poise.body.table import BodyRow, BodyTable, Geom
 
 __all__ = [
     "Anatomy",

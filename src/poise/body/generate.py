@@ -9,10 +9,18 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 
-from poise.body import table as presets
+from poise.body import body_table as presets
+from poise.body.body_table import (
+    PARTS,
+    BodyRow,
+    BodyTable,
+    Strength,
+    default_mass,
+    floats,
+    length_factor,
+)
 from poise.body.parts import Anatomy, Part, find_anatomy
 from poise.body.shapes import Ruler, geoms_of
-from poise.body.table import PARTS, BodyRow, BodyTable, Strength, default_mass, floats, length_factor
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate

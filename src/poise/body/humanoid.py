@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from poise.body.table import BodyTable
+from poise.body.body_table import BodyTable
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 

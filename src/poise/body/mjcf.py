@@ -12,9 +12,9 @@ from xml.parsers.expat import ExpatError
 
 import numpy as np
 
-from poise.body import table as presets
+from poise.body import body_table as presets
+from poise.body.body_table import PARTS, BodyRow, BodyTable, Geom, PartNumbers, Strength, floats
 from poise.body.parts import find_anatomy
-from poise.body.table import PARTS, BodyRow, BodyTable, Geom, PartNumbers, Strength, floats
 from poise.errors import PoiseError, brief
 from poise.formats.limited import read_limited
 from poise.formats.text import check_file, shown

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from poise.body import table as presets
+from poise.body import body_table as presets
+from poise.body.body_table import PARTS, Geom
 from poise.body.parts import Anatomy, Part
-from poise.body.table import PARTS, Geom
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import matrix_to_quat, quat_mul, quat_rotate_inv

@@ -4,33 +4,27 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.console import LOST, Answer, print_card, say, table, tell
 from poise.cli.inbetween import frames_of
 from poise.cli.options import (
-    Budget,
-    Earlier,
+    Directing,
     Flag,
     Force,
     HoldFeet,
-    InPlaceMode,
     Json,
     Out,
-    Pins,
     PolicyFile,
     Reading,
-    Span,
-    Threads,
-    Touches,
-    Weights,
     check_range,
     places,
 )
+from poise.cli.settings import TRACK, derived, given
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -41,6 +35,12 @@ if TYPE_CHECKING:
 
 #: s outside the keyframes that are worth a sentence.
 LONG_S = 5.0
+
+
+if TYPE_CHECKING:
+    Tracking: TypeAlias = Any
+else:
+    Tracking = derived(TRACK, "", "controller", "seed", "threads", "in_place")
 
 
 @dataclass(frozen=True)
@@ -66,23 +66,13 @@ class Options:
     policy: PolicyFile = None
     model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """A trained in-betweening network; by default the one that comes with Poise."""
-    controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
-    """See poise track."""
-    budget: Budget = None
-    weight: Weights = ()
-    pin: Pins = ()
-    touch: Touches = ()
-    span: Span = None
-    earlier: Earlier = None
     adapt: Annotated[int, arg(metavar="N")] = 20
     """Iterations of test-time adaptation for each gap; 0 does without."""
-    seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of all draws."""
-    threads: Threads = 0
-    in_place: InPlaceMode = "auto"
     hold_feet: HoldFeet = True
     force: Force = False
     json: Json = False
+    tracking: OmitArgPrefixes[Tracking] = field(default_factory=Tracking)
+    directing: OmitArgPrefixes[Directing] = Directing()
     reading: OmitArgPrefixes[Reading] = Reading()
 
 
@@ -98,9 +88,6 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         )
     keys = () if every else frames_of(o.keyframes)
     check_range("adapt", o.adapt, 0, 1000)
-    check_range("seed", o.seed, 0)
-    check_range("threads", o.threads, 0)
-    check_range("budget", o.budget, 1, 1_000_000)
     if o.kinematic:
         return _kinematic(o, keys)
     out, motion = places(o.out)
@@ -109,19 +96,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.complete import complete
     from poise.jobs.open import open_run
     from poise.jobs.result import story
-    from poise.jobs.track import TrackConfig
-    from poise.jobs.track.direction import direction_of
-    from poise.jobs.track.simulation import retake_of
-    from poise.plan import LookaheadConfig
+    from poise.jobs.track_settings import TrackConfig
     from poise.synthesis.filler import check_keyframes
     from poise.synthesis.inbetween import partials_of, times_of
 
-    ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
-    config = TrackConfig(
-        seed=o.seed, controller=o.controller, lookahead=ahead, threads=o.threads,
-        direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
-        in_place=o.in_place,
-    )  # fmt: skip
+    config = TrackConfig(**given(o.tracking), **o.directing.values())
     times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)
     keys = tuple(range(clip.frames)) if every else keys
@@ -172,7 +151,7 @@ def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
-    if o.partial or o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
+    if o.partial or o.retime or given(o.directing):
         raise PoiseError(
             "--kinematic has no body to direct or to wait for",
             hint="Leave it out",
@@ -194,7 +173,12 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     with contextlib.ExitStack() as shown:
         bar = staged(shown)
         filled = inbetween(
-            clip, keys, o.model, adapt=o.adapt, seed=o.seed, on_gap=lambda n, of: bar("filling", n, of)
+            clip,
+            keys,
+            o.model,
+            adapt=o.adapt,
+            seed=o.tracking.seed or 0,
+            on_gap=lambda n, of: bar("filling", n, of),
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_clip(filled.clip, path)

@@ -19,6 +19,7 @@ from poise.cli.options import (
     Reading,
     Threads,
     check_range,
+    lookahead_of,
     places,
 )
 from poise.cli.training import staged, working
@@ -74,13 +75,13 @@ def run(
         policy: the control policy; by default the one that comes with Poise.
         controller: lookahead tries in copies of the character before it acts; policy acts at once, ten
             times faster and rougher.
+        budget: simulated control steps of lookahead for each that is made, by default 192.
         recover: leave a character that has fallen where it lies.
         past: what the kinematic policy goes on from: its own frames, or what the character did.
         seed: seed of all draws.
     """
     check_range("seed", seed, 0)
     check_range("threads", threads, 0)
-    check_range("budget", budget, 1, 1_000_000)
     check_range("seconds", seconds, 0.1, 36_000)
     check_range("label-seconds", label_seconds, 0, 3600)
     folder, motion = places(out)
@@ -91,9 +92,8 @@ def run(
     from poise.jobs.endless.dreamt import Dream
     from poise.jobs.endless.model import load_generator
     from poise.jobs.open import open_run
-    from poise.plan import LookaheadConfig
 
-    ahead = LookaheadConfig() if budget is None else LookaheadConfig().with_budget(budget)
+    ahead = lookahead_of(budget)
     config = Dream(
         temperature=temperature, count=count, targets=targets, seed=seed, controller=controller,
         lookahead=ahead, recover=recover, past=past, style=style, label_seconds=label_seconds,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -123,16 +123,18 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     may_deliver(out, motion, o.force or held, o.clip)
     nothing, t = from_nothing(o, run), o.training
     from poise.jobs.imitate import Job
+    from poise.jobs.practice import Watching
     from poise.jobs.result import story
 
     with Shown((o.clip,), o.reading, t, run, out) as shown:
-        told = shown.watching(
-            follow=lambda *how: tracks(shown, *how),
-            first=lambda first: first_result(first, out, motion, o.hold_feet),
-            unfit=unfit,
-            iteration=lambda p: practised(shown, p),
-            beginning=lambda task: beginning(first_delivery(task, out, motion, o.hold_feet)),
-        )
+        mine: dict[str, Any] = {
+            "follow": lambda *how: tracks(shown, *how),
+            "first": lambda first: first_result(first, out, motion, o.hold_feet),
+            "unfit": unfit,
+            "iteration": lambda p: practised(shown, p),
+            "beginning": lambda task: beginning(first_delivery(task, out, motion, o.hold_feet)),
+        }
+        told = Watching(**(shown.callbacks | mine))
         how = (t.threads, t.device, o.in_place, told, True)
         try:
             made = Job(shown.read, run, config, t.until(), *how).done(o.going_on, nothing)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from poise.body import BodyConfig
     from poise.learn import Until
     from poise.motion import Clip
+    from poise.plan import LookaheadConfig
 
     Chosen: TypeAlias = Any
 else:
@@ -35,95 +36,30 @@ T = TypeVar("T")
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 
 
-def _option(help: str, **how: Any) -> Any:
-    return arg(help=help, **{"help_behavior_hint": "", **how})
+def _option(help: str, metavar: str | None = None, **how: Any) -> Any:
+    return arg(help=help, metavar=metavar, **{"help_behavior_hint": "", **how})
 
 
 #: Options that several verbs have, with what their help says.
 Json = Annotated[bool, _option("Print one JSON document and nothing else on stdout, see docs/cli.md.")]
 Force = Annotated[bool, _option("Write over files that are there.")]
 OpenPage = Annotated[bool, _option("Open the page in the browser.")]
-Out = Annotated[
-    Path,
-    arg(
-        aliases=["-o"],
-        metavar="DIR|FILE",
-        help="The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the "
-        "rest goes into a folder of its name.",
-    ),
-]
-HoldFeet = Annotated[
-    bool,
-    _option(
-        "Leave feet as simulated; by default standing feet are held to the spot in the written motion."
-    ),
-]
-PolicyFile = Annotated[
-    Path | None,
-    _option(
-        "A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that "
-        "comes along and is told places alone; by default the one for rotations that comes with Poise.",
-        metavar="FILE|RUN",
-    ),
-]
+_OUT = """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
+into a folder of its name."""
+Out = Annotated[Path, arg(help=" ".join(_OUT.split()), aliases=["-o"], metavar="DIR|FILE")]
+_FEET = "Leave feet as simulated; by default standing feet are held to the spot in the written motion."
+HoldFeet = Annotated[bool, _option(_FEET)]
+_POLICY = """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that
+comes along and is told places alone; by default the one for rotations that comes with Poise."""
+PolicyFile = Annotated[Path | None, _option(" ".join(_POLICY.split()), "FILE|RUN")]
 Threads = Annotated[int, arg(metavar="N", help="Cores; 0 is all.")]
-Budget = Annotated[
-    float | None,
-    _option(
-        "Simulated control steps of lookahead for each that is made, by default 192, or 768 for "
-        "keyframes. More are nearer and cleaner, and take longer.",
-        metavar="STEPS",
-    ),
-]
-Weights = Annotated[
-    UseAppendAction[tuple[str, ...]],
-    arg(
-        metavar="PART=FACTOR[:A-B]",
-        help="Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in "
-        "frames.",
-    ),
-]
-Pins = Annotated[
-    UseAppendAction[tuple[str, ...]],
-    arg(
-        metavar="LIMB:A-B",
-        help="Hands or feet that stay where they are in frames A to B, such as left_foot:12-40.",
-    ),
-]
-Touches = Annotated[
-    UseAppendAction[tuple[str, ...]],
-    arg(
-        metavar="LIMB:FRAME:X,Y,Z",
-        help="Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1.",
-    ),
-]
-Span = Annotated[
-    str | None,
-    _option(
-        "Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it.",
-        name="range",
-        metavar="A-B",
-    ),
-]
-Earlier = Annotated[
-    Path | None,
-    _option(
-        "The folder of an earlier result of the same motion, for --range.",
-        name="from",
-        metavar="RESULT",
-    ),
-]
+Budget = Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")]
+_PLACE = """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
+place again, a loop as a loop; travel writes it with its travel; keep simulates it as it is."""
+InPlaceMode = Annotated[Literal["auto", "keep", "travel"], arg(help=" ".join(_PLACE.split()))]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
 #: `formats.guess.UPS`; stated here since motion is imported only when a verb reads.
 Up = Literal["Y", "Z", "X", "-Y", "-Z", "-X"]
-InPlaceMode = Annotated[
-    Literal["auto", "keep", "travel"],
-    arg(
-        help="A clip that walks in place is simulated with the travel that its feet tell. auto writes "
-        "it in place again, a loop as a loop; travel writes it with its travel; keep simulates it as it "
-        "is."
-    ),
-]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 
@@ -214,6 +150,51 @@ class Reading:
                 code="option-malformed",
             )
         return height
+
+
+Texts: TypeAlias = UseAppendAction[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Directing:
+    """What a director wants of a motion, and how well it is looked for."""
+
+    weight: Annotated[Texts, arg(metavar="PART=FACTOR[:A-B]")] = ()
+    """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
+    pin: Annotated[Texts, arg(metavar="LIMB:A-B")] = ()
+    """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
+    touch: Annotated[Texts, arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
+    """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
+    span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
+    """Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
+    earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
+    """The folder of an earlier result of the same motion, for --range."""
+    budget: Budget = None
+    """Simulated control steps of lookahead for each that is made, by default 192, or 768 for keyframes.
+    More are nearer and cleaner, and take longer."""
+
+    def values(self) -> dict[str, Any]:
+        """What is stated, as settings of `TrackConfig`.
+
+        Raises:
+            PoiseError: words that make no sense.
+        """
+        from poise.jobs.track.direction import direction_of
+        from poise.jobs.track.simulation import retake_of
+
+        return {
+            "direction": direction_of(self.weight, self.pin, self.touch),
+            "retake": retake_of(self.span, self.earlier),
+            "lookahead": lookahead_of(self.budget),
+        }
+
+
+def lookahead_of(budget: float | None) -> LookaheadConfig:
+    """Lookahead with so many simulated control steps for each that is made."""
+    check_range("budget", budget, 1, 1_000_000)
+    from poise.plan import LookaheadConfig
+
+    return LookaheadConfig() if budget is None else LookaheadConfig().with_budget(budget)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from poise.cli.options import (
     Reading,
     Threads,
     check_range,
+    lookahead_of,
 )
 from poise.cli.push import direction_of
 from poise.cli.training import working
@@ -101,11 +102,11 @@ def run(
             the ball something comes along; none goes without.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the
             scene.
+        budget: simulated control steps of lookahead for each that is made, by default 192.
     """
     check_range("count", count, 1, 1024)
     check_range("duration", duration, 0.5, 3600)
     check_range("threads", threads, 0)
-    check_range("budget", budget, 1, 1_000_000)
     if budget is not None and controller != "lookahead":
         what = "--budget is for --controller lookahead"
         raise PoiseError(
@@ -114,11 +115,10 @@ def run(
     for name in RESULTS:
         may_write(out / name, force, *([clip] if clip else []))
     from poise.jobs.open import open_run
-    from poise.papers.compliant.play import play
-    from poise.papers.compliant.training import open_learned, shipped
-    from poise.plan import LookaheadConfig
+    from poise.papers.compliant.scene_play import play
+    from poise.papers.compliant.scene_training import open_learned, shipped
 
-    how = LookaheadConfig() if budget is None else LookaheadConfig().with_budget(budget)
+    how = lookahead_of(budget)
     stated: dict[str, Any] = {
         "newtons": newtons,
         "direction": direction_of(direction),

@@ -26,16 +26,18 @@ T = TypeVar("T")
 #: The dataclass of each recipe's settings.
 SOURCES = {
     "residual-force": "poise.recipes.residual_force_settings:ResidualForce",
-    "inbetween": "poise.jobs.inbetween.settings:Inbetween",
+    "inbetween": "poise.jobs.inbetween.inbetween_settings:Inbetween",
     "perpetual": "poise.papers.perpetual.ablations:StagedPerpetual",
-    "endless": "poise.jobs.endless.training:Endless",
-    "compliant": "poise.papers.compliant.training:Compliant",
+    "endless": "poise.jobs.endless.endless_training:Endless",
+    "compliant": "poise.papers.compliant.scene_training:Compliant",
 }
+#: The dataclass of how a motion is tracked.
+TRACK = "poise.jobs.track_settings:TrackConfig"
 _METAVARS = {float: "X", int: "N", str: "TEXT"}
 
 
 def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
-    """A frozen dataclass of options for the fields `names` of a recipe's settings.
+    """A frozen dataclass of options for the fields `names` of settings: of a recipe, or at a place.
 
     A field that the command line does not state is None, or for a switch its default, so that
     `given` knows what was stated.
@@ -46,7 +48,7 @@ def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:
     """
     from tyro.conf import arg
 
-    kind = imported(SOURCES[recipe])
+    kind = imported(SOURCES.get(recipe, recipe))
     texts, made = _texts(kind), []
     for name in (*names, *flags):
         type_, default, text = _plain_type(kind, name), getattr(kind, name), texts[name]
@@ -156,9 +158,7 @@ def base_of(
         return from_toml(type(default), config, verb)
     if preset is None:
         return default
-    from poise.jobs.presets import preset_of
-
-    return preset_of(recipe, preset, clip)
+    return imported("poise.jobs.presets:preset_of")(recipe, preset, clip)
 
 
 def dotted(argv: Sequence[str]) -> list[str]:

@@ -4,45 +4,44 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.console import INTERRUPTED, LOST, Answer, print_card, say, tell
 from poise.cli.options import (
-    Budget,
-    Earlier,
+    Directing,
     Flag,
     Force,
     HoldFeet,
-    InPlaceMode,
     Json,
     Out,
-    Pins,
     PolicyFile,
     Reading,
-    Span,
-    Threads,
-    Touches,
-    Weights,
     check_range,
     each,
     places,
 )
-from poise.cli.training import clock, showing, staged, working
+from poise.cli.settings import TRACK, derived, given
+from poise.cli.training import clock, left, showing, staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stages import Progress
     from poise.jobs.result import Result
-    from poise.jobs.track import TrackConfig
+    from poise.jobs.track_settings import TrackConfig
     from poise.jobs.tracker import Tracker
     from poise.kinematics.supports import Support
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
+
+    Tracking: TypeAlias = Any
+else:
+    NAMES = "controller body reset_on_fail recover count seed threads in_place"
+    Tracking = derived(TRACK, "", *NAMES.split())
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,6 @@ class Options:
     ] = ()
     """Motion files: clips of any human skeleton, or keypoints; or one folder, each file on its own."""
     policy: PolicyFile = None
-    controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
-    """policy acts alone, at once; lookahead tries in copies of the character before it acts, which is
-    nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto
-    looks ahead, and searches what is lost so."""
-    body: Literal["policy", "own"] = "policy"
-    """policy is the body that it was trained on, onto which the motion is retargeted; own has the same
-    joints with the lengths and masses of the skeleton that came in."""
-    budget: Budget = None
     characters: Annotated[int, arg(metavar="N")] = 512
     """Characters that search at once; more find harder motions."""
     rounds: Annotated[int, arg(metavar="N")] = 1
@@ -73,33 +64,20 @@ class Options:
     learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
     """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
-    threads: Threads = 0
-    reset_on_fail: Flag = False
-    """Put a character that is 0.5 m off back onto the motion, and go on."""
-    recover: Flag = False
-    """A character that is 0.5 m off gets up, walks back and goes on where the motion waits for it."""
-    count: Annotated[int, arg(metavar="N")] = 1
-    """Characters that do the motion side by side in one world, where they may collide."""
     supports: Flag = True
     """Put nothing beside the motion; by default a box stands where a single motion sits, leans or steps
     on something, and a sentence says so."""
     support: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Boxes beside the motion that stand there instead (.json), such as a result's supports.json."""
-    weight: Weights = ()
-    pin: Pins = ()
-    touch: Touches = ()
-    span: Span = None
-    earlier: Earlier = None
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
-    seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of the noise, and of what lookahead, search and --learn draw."""
-    in_place: InPlaceMode = "auto"
     hold_feet: HoldFeet = True
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the policy as one file (.safetensors), which starts faster than a run folder."""
     force: Force = False
     json: Json = False
+    tracking: OmitArgPrefixes[Tracking] = field(default_factory=Tracking)
+    directing: OmitArgPrefixes[Directing] = Directing()
     reading: OmitArgPrefixes[Reading] = Reading()
 
 
@@ -122,6 +100,20 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         return each("track", o.clips, o.out, one)
 
 
+def config_of(o: Options) -> TrackConfig:
+    """How it is tracked, as the command line states it."""
+    from poise.jobs.track.noise import noise_of
+    from poise.jobs.track_settings import TrackConfig
+    from poise.plan import SamplingConfig
+
+    more = given(o.tracking) | o.directing.values()
+    search = SamplingConfig(o.characters, rounds=o.rounds)
+    how = {"noise": noise_of(o.noise), "supports": supports_wanted(o), "smooth_hz": o.reading.smooth}
+    config = TrackConfig(search=search, **how, **more)
+    config.check(len(o.clips))
+    return config
+
+
 def check(o: Options) -> None:
     """Refuses what makes no sense, before anything is read or made."""
     if not o.clips:
@@ -142,26 +134,21 @@ def check(o: Options) -> None:
             hint="Leave it out, or learn clip by clip",
             code="single-clip-only",
         )
-    check_range("count", o.count, 1, 64)
-    check_range("seed", o.seed, 0)
     check_range("learn", o.learn, 0, 100_000)
-    check_range("characters", o.characters, 8, 65_536)
-    check_range("rounds", o.rounds, 1, 20)
-    check_range("budget", o.budget, 1, 1_000_000)
-    check_range("threads", o.threads, 0)
-    if o.learn and o.body == "own":
+    config = config_of(o)
+    if o.learn and config.body == "own":
         raise PoiseError(
             "the policy learns on its own body",
             hint="Leave --body own or --learn out",
             code="option-conflict",
         )
-    if o.learn and o.earlier:
+    if o.learn and config.retake:
         raise PoiseError(
             "--learn learns the whole motion, and --range does a part",
             hint="Leave one out",
             code="option-conflict",
         )
-    if o.learn and o.noise:
+    if o.learn and config.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
         raise PoiseError(what, hint="Leave one out", code="option-conflict")
 
@@ -177,31 +164,16 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     may_deliver(out, motion, o.force or goes_on, *o.clips)
     if o.save_policy is not None:
         may_write(o.save_policy, o.force)
-    if motion is not None and o.count > 1:
+    if motion is not None and (o.tracking.count or 1) > 1:
         raise PoiseError(
             "several characters make several files", motion, "Give a folder as -o", code="folder-needed"
         )
     from poise.jobs.open import open_run
     from poise.jobs.result import story
-    from poise.jobs.track import TrackConfig
-    from poise.jobs.track.direction import direction_of
-    from poise.jobs.track.noise import noise_of
-    from poise.jobs.track.simulation import retake_of
     from poise.jobs.tracker import save_tracker
-    from poise.plan import LookaheadConfig, SamplingConfig
 
-    noise, stands = noise_of(o.noise), supports_wanted(o)
-    ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
-    search = SamplingConfig(o.characters, rounds=o.rounds)
-    config = TrackConfig(
-        noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
-        smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
-        search=search, threads=o.threads, body=o.body, supports=stands,
-        direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
-        in_place=o.in_place,
-    )  # fmt: skip
-    config.check(len(o.clips))
-    given = [read(clip, o.reading) for clip in o.clips]
+    config = config_of(o)
+    motions = [read(clip, o.reading) for clip in o.clips]
     if tracker is None:
         with working("opening the policy"):
             tracker = open_run(o.policy).tracker
@@ -209,13 +181,13 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         # What is to be learned is the motion alone.
         plain = replace(config, recover=False, controller="policy") if o.learn else config
         said_early = list[str]()
-        tracked = follow(tracker, given, plain, said_early)
+        tracked = follow(tracker, motions, plain, said_early)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
                 kept = {"learned": out / "learned"}
                 return Answer(outputs=kept, exit_code=INTERRUPTED, outcome="interrupted")
             tracker, before = learned, tracked
-            tracked = max(follow(learned, given, config, said_early), before, key=lambda t: t.merit)
+            tracked = max(follow(learned, motions, config, said_early), before, key=lambda t: t.merit)
             if tracked is before:
                 tell("What was learned does it no better: the motion as it was before stays.")
         with working("writing"):
@@ -223,7 +195,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             if o.save_policy is not None:
                 save_tracker(tracker, o.save_policy)
     print_card(done.card)
-    told = story(tracked, o.reset_on_fail)
+    told = story(tracked, config.reset_on_fail)
     if told.failed:
         for doubt in (d for d in tracked.doubts if d not in said_early):
             say(doubt)
@@ -231,7 +203,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     for part in tracked.parts:
         say(part.sentence())
     if told.word == "lost":
-        say(advice(o, tracked))
+        say(advice(o, config, tracked))
     failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
     result = {
         "outcome": told.word,
@@ -296,7 +268,6 @@ def telling(said: list[str]) -> Callable[[str], None]:
 
 def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
-    from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
     from poise.learn import Until
 
@@ -305,13 +276,15 @@ def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) 
     with showing("learning") as bar:
 
         def show(p: Progress) -> None:
-            bar(p.share, f"{times(p)}  {p.stats.samples_per_s:,.0f} samples/s")
+            spent = f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)}"
+            bar(p.share, f"{spent}  {p.stats.samples_per_s:,.0f} samples/s")
             if p.results is not None:
                 came, whole = (float(x) / rate for x in (p.results.tracked, p.results.frames))
                 tell(f"{clock(p.stats.seconds)}  it gets to {came:.1f} of {whole:.1f} s")
 
         until = Until(minutes=o.learn)
-        learned = learn(tracker, tracked.placed, folder, until, show, o.threads, o.seed)
+        threads, seed = o.tracking.threads or 0, o.tracking.seed or 0
+        learned = learn(tracker, tracked.placed, folder, until, show, threads, seed)
     if learned.result.interrupted:
         tell("Stopped; what was learned is saved. The same command goes on.")
         return None
@@ -321,18 +294,20 @@ def practise(options: Options, tracker: Tracker, tracked: Result, folder: Path) 
     return learned.tracker
 
 
-def advice(options: Options, tracked: Result) -> str:
+def advice(options: Options, config: TrackConfig, tracked: Result) -> str:
     """What to do about a motion that was lost."""
     o = options
     if tracked.parts:
-        again = "" if o.recover else "With --recover the character comes back to a clip that it lost. "
-        return f"{again}poise track CLIP does a single clip, and searches what is lost."
+        back = "With --recover the character comes back to a clip that it lost. "
+        told = "poise track CLIP does a single clip, and searches what is lost."
+        return told if config.recover else back + told
     learns = "with --learn 10 the policy first learns this motion, for 10 minutes at most."
     if o.learn:
         return f"The same command with more minutes goes on learning: --learn {2 * o.learn:g}."
     if tracked.found is not None:
         return f"Try --characters {2 * o.characters}; or {learns}"
-    if o.count == 1 and o.controller != "auto" and not (o.recover or o.reset_on_fail):
+    back = config.recover or config.reset_on_fail
+    if config.count == 1 and config.controller != "auto" and not back:
         return f"With --controller auto many characters search what is lost; {learns}"
     return "W" + learns[1:]
 

@@ -91,10 +91,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             code="argument-missing",
         )
     from poise.jobs.imitate import Job
+    from poise.jobs.practice import Watching
 
     t = o.training
     with Shown(o.clips, o.reading, t, o.out, o.out) as shown:
-        how = (t.threads, t.device, "auto", shown.watching(), True)
+        how = (t.threads, t.device, "auto", Watching(**shown.callbacks), True)
         result = Job(shown.read, o.out, config, t.until(), *how).learned()[1]
     if result.interrupted:
         return stopped(o.out, again)

@@ -14,14 +14,14 @@ from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.papers.compliant.training import Compliant
+    from poise.papers.compliant.scene_training import Compliant
 
 
 def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
     """Trains until the limit or Ctrl-C."""
     from poise.jobs.open import open_run
     from poise.learn import LATEST, Until
-    from poise.papers.compliant.training import RUN_FILE, train
+    from poise.papers.compliant.scene_training import RUN_FILE, train
 
     if training.device != "cpu":
         raise PoiseError(

@@ -16,8 +16,8 @@ from poise.machine import cores
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.jobs.endless.training import Endless
-    from poise.learn.inbetween import BlockStats
+    from poise.jobs.endless.endless_training import Endless
+    from poise.learn.inbetween_model import BlockStats
 
 
 def run(
@@ -29,8 +29,8 @@ def run(
     """
     import torch
 
+    from poise.jobs.endless.endless_training import RUN_FILE, begin, train_generator
     from poise.jobs.endless.model import GENERATOR, read_labels
-    from poise.jobs.endless.training import RUN_FILE, begin, train_generator
     from poise.jobs.open import open_run
 
     folder = library.folder("endless")

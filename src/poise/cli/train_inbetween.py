@@ -19,8 +19,8 @@ from poise.machine import cores
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.jobs.inbetween.training import Inbetween
-    from poise.learn.inbetween import BlockStats
+    from poise.jobs.inbetween.inbetween_training import Inbetween
+    from poise.learn.inbetween_model import BlockStats
 
 if TYPE_CHECKING:
     _Derived: TypeAlias = Any
@@ -41,7 +41,7 @@ def run(library: Library, config: Inbetween, out: Path, training: Training, agai
     """Trains until the last step or Ctrl-C."""
     import torch
 
-    from poise.jobs.inbetween.training import RUN_FILE, begin, train
+    from poise.jobs.inbetween.inbetween_training import RUN_FILE, begin, train
 
     folder = library.folder("inbetween")
     if library.backwards:

@@ -22,7 +22,7 @@ from poise.jobs.keep import claimed
 from poise.settings import imported
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.run import PerpetualResult
+    from poise.jobs.perpetual.perpetual_run import PerpetualResult
     from poise.jobs.perpetual.stages import Progress
     from poise.recipes.imitation import Imitation
     from poise.score import RecoveryCard
@@ -236,7 +236,7 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
 
     returns: the policy tracks recovery motions already, so that primitives may learn what it fails.
     """
-    from poise.jobs.perpetual import run
+    from poise.jobs.perpetual import perpetual_run
     from poise.papers.perpetual import ablations
 
     library, primitives, body = o.library, o.primitives, o.body
@@ -252,7 +252,7 @@ def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     more, of_the_body = stated(body.set, imported(SOURCES["perpetual"]))
     names += [text.partition("=")[0] for text in of_the_body]
     # A part that is kept, one of its settings, or a part with a setting that is kept.
-    kept = [f"{name}." for name in run.KEPT | ablations.KEPT]
+    kept = [f"{name}." for name in perpetual_run.KEPT | ablations.KEPT]
     names += [n for n in more if any(f"{n}.".startswith(k) or k.startswith(f"{n}.") for k in kept)]
     if names:
         what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
@@ -292,7 +292,7 @@ def run(o: TrainOptions, config: StagedPerpetual, again: str) -> Answer:
         raise PoiseError(
             "the recipe perpetual trains in one process", hint=hint, code="option-not-applicable"
         )
-    from poise.jobs.perpetual.run import train
+    from poise.jobs.perpetual.perpetual_run import train
     from poise.jobs.run_file import RUN_FILE
     from poise.learn import LATEST, Until
 
@@ -352,7 +352,7 @@ def begin(
     held: the run folder holds a run already, which then is all that is read. tracker: the policy that it
     goes on from or is taught by.
     """
-    from poise.jobs.perpetual import run as perpetual_run
+    from poise.jobs.perpetual import perpetual_run
 
     folder = library.folder("perpetual")
     hold_out, never = ((p,) if p else () for p in (library.hold_out, library.never))

@@ -17,9 +17,9 @@ from rich.text import Text
 from poise.cli.console import INTERRUPTED, Answer, err, launched, notes, say, tell
 from poise.cli.options import Reading, Training
 from poise.errors import PoiseError
+from poise.jobs.keep import EVALUATING
 
 if TYPE_CHECKING:
-    from poise.jobs.practice import Watching
     from poise.jobs.warm_start import TrainingCallbacks
     from poise.learn import CloneStats, IterationStats, PolicyBundle, Until, WarmStart
     from poise.motion import Clip, ClipLibrary
@@ -255,8 +255,6 @@ class Shown:
     def doing(self, what: str) -> Iterator[None]:
         """What takes seconds."""
         self.close()
-        from poise.jobs.practice import EVALUATING
-
         if what == EVALUATING:
             self.where = " in the evaluation"
         with working(what):
@@ -290,14 +288,11 @@ class Shown:
         """Tells a sentence."""
         tell(sentence, "yellow")
 
-    def watching(self, **more: Any) -> Watching:
-        """The callbacks of a job."""
-        from poise.jobs.practice import Watching
-
-        own: dict[str, Any] = {
-            name: getattr(self, name) for name in ("say", "doing", "given", "begun", "stats")
-        }
-        return Watching(**{"beginning": lambda _: beginning(), **own, **more})
+    @property
+    def callbacks(self) -> dict[str, Any]:
+        """The callbacks of a job, see `jobs.practice.Watching`."""
+        own = {name: getattr(self, name) for name in ("say", "doing", "given", "begun", "stats")}
+        return {"beginning": lambda _: beginning(), **own}
 
 
 def summary(card: ScoreCard) -> str:

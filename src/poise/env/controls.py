@@ -1,4 +1,4 @@
-"""Forces and targets of a control step: actions, filtered, with help and plug-ins' forces."""
+"""Forces and targets of a control step: actions, filtered, with help and events' forces."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.control import PDTargets, Residual, Wrench
 from poise.env.evaluate import TensorFunction, record
+from poise.env.events import Event
 from poise.env.frame import hinge_torques
 from poise.env.goal import Goal
 from poise.env.help import HelpBudget
-from poise.env.plugins import Plugin
+from poise.env.recovery.clock import RecoveryClock
 from poise.env.task import TaskConfig
 from poise.errors import PoiseError
 from poise.sim import Backend, Drive, NanGuard
@@ -34,8 +35,8 @@ def unkept_actions(actions: Tensor, last: Tensor, kept: Tensor, hinges: int) -> 
 class Actuation:
     """Fills a backend's drive from actions of `hinges` joint actions followed by the residual's.
 
-    fused: recorded once, with and without help, and replayed as a whole. pushing, pushing_substeps:
-    plug-ins that add forces, at the control and at the physics rate.
+    fused: recorded once, with and without help, and replayed as a whole. events: add forces, at the
+    control and at the physics rate.
     """
 
     def __init__(
@@ -44,11 +45,10 @@ class Actuation:
         pd: PDTargets,
         residual: Residual | None,
         fused: bool,
-        pushing: Sequence[Plugin] = (),
-        pushing_substeps: Sequence[Plugin] = (),
+        events: Sequence[Event] = (),
     ):
-        self.pushing, self.pushing_substeps = pushing, pushing_substeps
-        self.backend, self.pd, self.residual, self.fused = backend, pd, residual, fused
+        self.events, self.backend, self.fused = events, backend, fused
+        self.pd, self.residual = pd, residual
         self.hinges = backend.model.nu
         #: Bodies of the humanoid's table that the residual may push.
         self.bodies: tuple[int, ...] = getattr(residual, "bodies", (0,))
@@ -84,26 +84,26 @@ class Actuation:
         force, torque, point = self.functions[helped](*given)
         return None if residual is None else Wrench(force, torque, point, self.bodies)
 
-    def push(self) -> None:
-        """Adds the forces of plug-ins that hold for the control step."""
-        for plugin in self.pushing:
-            plugin.push(self.backend.drive)
+    def before(self) -> bool:
+        """Adds the forces of events that hold for the control step; whether there are more, told anew
+        before each physics step."""
+        return any([event.before_step(self.backend.drive) for event in self.events])
 
     def held(self) -> tuple[Tensor, ...]:
         """What is in the drive, to begin each physics step with."""
         drive = self.backend.drive
         return drive.ctrl.clone(), drive.qfrc_applied.clone(), drive.xfrc_applied.clone()
 
-    def push_substep(self, held: tuple[Tensor, ...] | None) -> None:
-        """Adds the forces of plug-ins that are told anew before each physics step to what was `held`;
+    def substep(self, held: tuple[Tensor, ...] | None) -> None:
+        """Adds the forces of events that are told anew before each physics step to what was `held`;
         None where that is in the drive already."""
         drive = self.backend.drive
         if held is not None:
             parts = drive.ctrl, drive.qfrc_applied, drive.xfrc_applied
             for part, value in zip(parts, held, strict=True):
                 part.copy_(value)
-        for plugin in self.pushing_substeps:
-            plugin.push_substep(drive)
+        for event in self.events:
+            event.before_substep(drive)
 
     def with_help(
         self, action: Tensor, targets: Tensor, rows: Tensor, *state: Tensor
@@ -149,7 +149,7 @@ class Controls:
         task: TaskConfig,
         backend: Backend,
         humanoid: Humanoid,
-        plugins: Sequence[Plugin],
+        events: Sequence[Event],
         fused: bool,
     ):
         hinges = len(humanoid.hinges)
@@ -166,12 +166,8 @@ class Controls:
         self.torque_before = torch.zeros(n, hinges, device=here)
         self.linvel_before = torch.zeros(n, len(humanoid.bodies), 3, device=here)
         self.wrench: Wrench | None = None
-        # Only plug-ins that change a hook are asked by it.
-        self._targeting, *pushing = (
-            tuple(p for p in plugins if getattr(type(p), hook) is not getattr(Plugin, hook))
-            for hook in ("targets", "push", "push_substep")
-        )
-        self.actuation = Actuation(backend, task.pd, task.residual, fused, *pushing)
+        self._recovery = next((event for event in events if isinstance(event, RecoveryClock)), None)
+        self.actuation = Actuation(backend, task.pd, task.residual, fused, events)
         self._every = torch.arange(n, device=here)
 
     def apply(self, actions: Tensor, age: Tensor, goal: Goal, budget: HelpBudget, torques: bool) -> None:
@@ -197,11 +193,9 @@ class Controls:
         if self._task.guide is not None and budget.now > 0:
             self.action[:, self.hinges :] += self._task.guide(self._backend.state, goal)
         targets, rows = goal.targets()
-        if self._targeting and self._task.pd.mode == "additive":
-            targets, rows = targets[rows], self._every
-            for plugin in self._targeting:
-                targets = plugin.targets(targets)
-        left = budget.at(goal.group(self._task.help_by))
+        if self._recovery is not None and self._task.pd.mode == "additive":
+            targets, rows = self._recovery.targets(targets[rows]), self._every
+        left = budget.at(budget.group(goal))
         self.wrench = self.actuation.apply(self.action, targets, rows, left, budget.now > 0)
 
     def sources(self) -> dict[str, Tensor]:
@@ -229,13 +223,11 @@ def steps(drivers: Sequence[Actuation], step: Callable[[int], None], substeps: i
 
     step: makes so many physics steps with what is in the drives.
     """
-    for driver in drivers:
-        driver.push()
-    if not any(plugin.busy() for driver in drivers for plugin in driver.pushing_substeps):
+    if not any([driver.before() for driver in drivers]):
         step(substeps)
         return
     held = [driver.held() for driver in drivers]
     for k in range(substeps):
         for driver, values in zip(drivers, held, strict=True):
-            driver.push_substep(values if k else None)
+            driver.substep(values if k else None)
         step(1)

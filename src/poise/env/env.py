@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TypeVar
 
 import torch
@@ -14,12 +14,14 @@ from poise.control import Wrench
 from poise.env import frame as observables
 from poise.env.controls import Controls
 from poise.env.evaluate import Sources, Terms, seen_by
+from poise.env.events import BodyAssignment, EpisodeStart, Event, StepOutcome
 from poise.env.frame import FIELDS, Frame, Pose, placed
 from poise.env.goal import Goal
-from poise.env.plugins import EpisodesEnded, Plugin, combined, ends_of
+from poise.env.recovery.clock import RecoveryClock
 from poise.env.reference import Reference
 from poise.env.style import ClipFeatures, ClipWindows
-from poise.env.task import EnvStep, StepLog, TaskConfig, displaced_goal, goal_of, plugins_of
+from poise.env.task import EnvStep, StepLog, TaskConfig, displaced_goal, events_of, goal_of
+from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.machine import one_thread
 from poise.sim import Backend, NanGuard
@@ -31,7 +33,7 @@ class Snapshot:
 
     Attributes:
         worlds: tensors `(n, ...)` by name: physics "sim", and its "qpos" and "qvel" for another kind of
-            backend; the goal's and the plug-ins' rows, "age", "action", ...
+            backend; the goal's and the events' rows, "age", "action", ...
         physics: width of the physics without derived fields, the first columns of "sim".
         goal: what the goal's rows point into.
         shared: what all worlds of the environment share: help, failure rates, odds, random generators;
@@ -89,8 +91,8 @@ def put(env: ImitationEnv, snapshot: Snapshot, rows: Tensor | None) -> None:
             value.copy_(snapshot.worlds[name])
         else:
             value[rows] = snapshot.worlds[name]
-    for plugin in env.plugins:
-        plugin.assign(rows, env.goal.body(rows))
+    if env.bodies is not None:
+        env.bodies.assign(rows, env.goal.clips.body(rows))
     sim, backend = snapshot.worlds["sim"], env.backend
     if sim.shape[1] == backend.snapshot().shape[1]:
         backend.restore(sim, rows)
@@ -101,8 +103,8 @@ def put(env: ImitationEnv, snapshot: Snapshot, rows: Tensor | None) -> None:
         # Another kind of backend, such as a world of several characters.
         backend.write(rows, snapshot.worlds["qpos"], snapshot.worlds["qvel"])
     if rows is None and snapshot.shared is not None:
-        for plugin in env.plugins:
-            plugin.load_state(snapshot.shared)
+        for event in env.events:
+            event.load_state(snapshot.shared)
         if "weights" in snapshot.shared:
             env.weights = snapshot.shared["weights"]
         env.goal.rng.set_state(snapshot.shared["rng"])
@@ -117,23 +119,23 @@ def state_of(env: ImitationEnv) -> dict[str, Tensor]:
         "age": env.age.clone(),
         "action": env.action.clone(),
         **env.goal.state(),
-        **{k: v for plugin in env.plugins for k, v in plugin.state().items()},
+        **{k: v for event in env.events for k, v in event.state().items()},
     }
 
 
 def put_state(env: ImitationEnv, state: Mapping[str, Tensor]) -> None:
     """Makes an environment what `state_of` told; see `ImitationEnv.load_state`."""
     env.goal.load_state(state)
-    for plugin in env.plugins:
-        plugin.assign(None, env.goal.body(None))
+    if env.bodies is not None:
+        env.bodies.assign(None, env.goal.clips.body(None))
     if state["sim"].dtype == env.backend.state.qpos.dtype:
         env.backend.restore(state["sim"])
     else:
         env.backend.write(None, state["qpos"], state["qvel"])
     for name in ("age", "action"):
         getattr(env, name).copy_(state[name])
-    for plugin in env.plugins:
-        plugin.load_state(state)
+    for event in env.events:
+        event.load_state(state)
     if env.goal.begins:
         env.weights = env.weights
 
@@ -142,18 +144,18 @@ def _rows(env: ImitationEnv) -> dict[str, Tensor]:
     """The tensors `(N, ...)` of an environment beside its physics, by name."""
     goal = {f"goal/{k}": v for k, v in env.goal.rows().items()}
     own = {"age": env.age, "action": env.action, **goal}
-    return {**own, **{k: v for plugin in env.plugins for k, v in plugin.rows().items()}}
+    return {**own, **{k: v for event in env.events for k, v in event.rows().items()}}
 
 
 def _shared(env: ImitationEnv) -> dict[str, Tensor]:
     """What all worlds of an environment share, by name."""
-    own = {k: v for plugin in env.plugins for k, v in plugin.state().items()}
+    own = {k: v for event in env.events for k, v in event.state().items()}
     if env.goal.begins:
         own["weights"] = env.weights
     return {**own, "rng": env.goal.rng.get_state()}
 
 
-P = TypeVar("P", bound=Plugin)
+E = TypeVar("E", bound=Event)
 
 
 class ImitationEnv:
@@ -171,8 +173,9 @@ class ImitationEnv:
 
     Attributes:
         goal, task, backend: as given.
-        plugins: help, adaptive sampling, recovery, bodies, ... as far as the task has them.
-        help: what is left of the residual force, see `HelpBudget`.
+        events: help, adaptive sampling, recovery, bodies, ... as far as the task has them.
+        help: what is left of the residual force, see `HelpBudget`; an event like the next two.
+        recovery, bodies: None for a task without recovery, and for a goal of one body.
         age: `(N,)` control steps since the episode began.
         action: `(N, A)` the last one, as it acted.
         given: `(N, A)` the last one, as it was given; the same without `TaskConfig.filter`.
@@ -201,18 +204,16 @@ class ImitationEnv:
         self.age = torch.zeros(n, dtype=torch.long, device=here)
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
-        self.help, self.plugins = plugins_of(task, self.goal, backend, seed)
-        # Only plug-ins that change a hook are asked by it.
-        self._holding, self._ticking, self._judging, self._logging, self._placing = (
-            tuple(p for p in self.plugins if getattr(type(p), hook) is not getattr(Plugin, hook))
-            for hook in ("held", "tick", "judged", "log", "placed")
-        )
+        self.help, self.events = events_of(task, self.goal, backend, seed)
+        self.recovery, self.bodies = self.event(RecoveryClock), self.event(BodyAssignment)
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        self.controls = Controls(task, backend, self.goal.humanoid, self.plugins, fused)
+        self.controls = Controls(task, backend, self.goal.humanoid, self.events, fused)
         self.num_actions = self.controls.num_actions
         self.action, self.given = self.controls.action, self.controls.given
         self._every = torch.arange(n, device=here)
+        # Whether outcomes are counted by the bins of clips.
+        self._counts = task.auto_reset and (task.adaptive > 0 or task.help_by == "bin")
         self._terms = self._make_terms(fused)
         self.goal.aim(None, None)
         # Once as they are, so that it is known which tensors the terms read.
@@ -232,18 +233,20 @@ class ImitationEnv:
         held = {"action": self.action, "age": self.age, **self.controls.sources()}
         # u is 0 in tasks in which nothing gives way.
         held |= {"compliance/u": u, "compliance/level": u[:, 0]}
-        for plugin in self.plugins:
-            named |= plugin.observables
-            held |= plugin.sources()
+        for event in self.events:
+            for name, value in event.tells().items():
+                if isinstance(value, Tensor):
+                    held[name] = value
+                else:
+                    named[name] = value
         self._sources = Sources(self.backend, held)
         roots = torch.as_tensor(model.body_rootid[1:], dtype=torch.long).to(here)
         self._left = None if task.left is None else task.left.to(here)
         context = observables.Context(
             self.goal.layout, self.goal.local, roots, self.hinges, task.residual, self._left
         )
-        ends = partial(ends_of, self.plugins, task.horizon)
         kinds = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
-        return Terms(*kinds, placed(task.style, here), named, context, ends, here, fused)
+        return Terms(*kinds, placed(task.style, here), named, context, task.horizon, here, fused)
 
     # --- what is followed ---------------------------------------------------------------------
 
@@ -276,21 +279,26 @@ class ImitationEnv:
 
     def set_goal(self, goal: Goal) -> Tensor:
         """Goes on with another goal of the same body, wherever the characters stand; observations."""
-        self.goal = displaced_goal(goal, self.task)
-        for plugin in self.plugins:
-            plugin.follow(self.goal)
+        if isinstance(self.goal, DisplacedGoal) and not isinstance(goal, DisplacedGoal):
+            self.goal.follow(goal)
+            self.goal.offset.zero_()
+            self.goal.rate.zero_()
+        else:
+            self.goal = goal
+        if (yielding := self.event(Yielding)) is not None and isinstance(self.goal, DisplacedGoal):
+            yielding.goal = self.goal
         self.goal.aim(None, self._held())
         return self.observe()
 
     def seek(self, clip: Tensor, frame: Tensor) -> Tensor:
         """Goes on at `frame[i]` of `clip[i]`, both `(N,)`, wherever world i stands; observations."""
-        self.goal.seek(clip, frame)
+        self.goal.reset(None, clip, frame)
         self.goal.aim(None, self._held())
         return self.observe()
 
-    def plugin(self, kind: type[P]) -> P | None:
-        """The plug-in of a kind, None without."""
-        return next((p for p in self.plugins if isinstance(p, kind)), None)
+    def event(self, kind: type[E]) -> E | None:
+        """The event of a kind, None without."""
+        return next((p for p in self.events if isinstance(p, kind)), None)
 
     # --- episodes -----------------------------------------------------------------------------
 
@@ -307,40 +315,42 @@ class ImitationEnv:
         """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; frames past the end of a clip
         that goes on are where its later cycles are. Gives observations.
 
-        kind: `(N,)` kinds of episodes of a plug-in, such as those of `poise.env.recovery`; None begins
-            ordinary ones.
+        kind: `(N,)` kinds of episodes, see `poise.env.recovery`; None begins ordinary ones.
         """
-        if kind is not None and not any(type(p).kinds is not Plugin.kinds for p in self.plugins):
+        if kind is not None and self.recovery is None:
             raise PoiseError(
                 "this task knows no falls", hint="Set TaskConfig.recovery", code="recovery-off"
             )
-        self.goal.seek(clip, frame)
+        self.goal.reset(None, clip, frame)
         self._place(None, kind)
         return self.observe()
 
-    def _restart(self, ids: Tensor) -> None:
-        """New episodes in worlds `ids (n,)`."""
-        self.goal.draw(ids)
-        drawn = (p.kinds(len(ids), self.goal.rng) for p in self.plugins)
-        self._place(ids, next((kind for kind in drawn if kind is not None), None))
+    def _restart(self, ids: Tensor) -> Tensor:
+        """New episodes in worlds `ids (n,)`; the worlds that see something else then."""
+        self.goal.reset(ids)
+        return self._place(ids, None, True)
 
-    def _place(self, ids: Tensor | None, kind: Tensor | None) -> None:
+    def _place(self, ids: Tensor | None, kind: Tensor | None, drawn: bool = False) -> Tensor:
         """Puts the characters of worlds `ids`, all for None, where their goals begin."""
-        rows = slice(None) if ids is None else ids
-        self.age[rows], self.action[rows] = 0, 0.0
-        for plugin in self.plugins:
-            plugin.assign(ids, self.goal.body(ids))
-        start = self.goal.start(ids)
-        for plugin in self.plugins:
-            start = plugin.start(ids, kind, start, self.goal.rng)
-        self.backend.write(ids, *start)
-        for plugin in self._placing:
-            plugin.placed(ids)
-        self.goal.aim(ids, self._held())
+        goal = self.goal
+        body = None if self.bodies is None else goal.clips.body(ids)
+        episodes = EpisodeStart(ids, goal.start(ids), goal.rng, body, kind, drawn)
+        self.age[episodes.rows], self.action[episodes.rows] = 0, 0.0
+        for event in self.events:
+            event.begin(episodes)
+        self.backend.write(ids, *episodes.start)
+        self._look(ids)
+        goal.aim(ids, self._held())
+        seeing = ids if episodes.seeing is None else episodes.seeing
+        return self._every if seeing is None else seeing
+
+    def _look(self, ids: Tensor | None) -> None:
+        for event in self.events:
+            event.look(ids)
 
     def _held(self) -> Tensor | None:
         """`(N,)` bool, worlds with goals that wait in the next step."""
-        return combined((p.held() for p in self._holding), torch.logical_or)
+        return None if self.recovery is None else self.recovery.held()
 
     # --- stepping -----------------------------------------------------------------------------
 
@@ -354,7 +364,8 @@ class ImitationEnv:
     def drive(self, actions: Tensor) -> None:
         """The first part of a step: fills the drive; the physics is then the caller's to step."""
         goal = self.goal
-        self._row, self._group = goal.row(), goal.group(self.task.help_by)
+        # Of the step that comes, since `advance` moves them on.
+        self._row, self._group = goal.clips.row if self._counts else None, self.help.group(goal)
         if self._sources.reads("linvel_before"):
             torch.sub(self.here().linvel, self.goal_pose().linvel, out=self.controls.linvel_before)
         self.controls.apply(actions, self.age, goal, self.help, self._sources.reads("torque_before"))
@@ -367,39 +378,38 @@ class ImitationEnv:
         ref, ahead = goal.advance(waited, self._held())
         seen = self._sources.of(self._told(None, ref, ahead))
         final, scores, ends, self._style = self._terms.judge(seen)
+        # Row 0 is r = sum_k w_k r_k, row 1 the part of it that is imitation, then each r_k.
         reward, self.imitation, *values = scores.unbind(0)
         self.terms = {t.name: v for t, v in zip(task.rewards, values, strict=True)}
+        rng = goal.rng if task.auto_reset else None
+        late = self.age >= task.horizon
+        self._outcome = outcome = StepOutcome(ends, late, ref, goal, self._row, self.age, rng)
+        for event in self.events:
+            event.judged(outcome)
         failed, terminated, truncated = ends.unbind(0)
-        for plugin in self._judging:
-            rng = goal.rng if task.auto_reset else None
-            plugin.judged(ends, ref, self.age >= task.horizon, rng)
         if task.completion_bonus:
+            # r (1 + b): with b = g + g^2 + ..., as many of these rewards as who goes on would earn.
             done = terminated & ~failed
             reward = torch.where(done, reward * (1.0 + task.completion_bonus), reward)
-        more = {k: v for p in self._logging for k, v in p.log().items()}
         limit = None if self._limit_n is None else self.help.limit(self._limit_n, self._group)
-        log = StepLog(self.terms, self.imitation, self.wrench, limit, more)
+        log = StepLog(self.terms, self.imitation, self.wrench, limit, outcome.log)
         return EnvStep(final, reward, terminated, truncated, final, log, failed)
 
     def tick(self) -> None:
         """Time goes on by a control step: all of `judge` that is needed where goals move otherwise."""
         self.age += 1
-        for plugin in self._ticking:
-            plugin.tick()
+        for event in self.events:
+            event.after_step()
 
     def renew(self, step: EnvStep) -> EnvStep:
         """The last part of a step: new episodes where one ended, and what is seen then."""
-        goal, final, obs = self.goal, step.final_obs, step.obs
+        final, obs, outcome = step.final_obs, step.obs, self._outcome
         if self.task.auto_reset:
-            ids = (step.terminated | step.truncated).nonzero().squeeze(-1)
-            counted = combined((p.counted() for p in self.plugins), torch.logical_and)
-            ended = EpisodesEnded(ids, step.failed, step.terminated, self.age, goal, self._row, counted)
-            for plugin in self.plugins:
-                plugin.count(ended)
-            if len(ids):
-                self._restart(ids)
-                for plugin in self.plugins:
-                    ids = plugin.seeing(ids)
+            for event in self.events:
+                event.count(outcome)
+            if len(outcome.ids):
+                ids = self._restart(outcome.ids)
+                # All others see what `judge` has made of them already.
                 obs = self._obs.copy_(final)
                 obs[ids] = self._terms.observe(self._sources.of(self._told(ids), ids))
         if self._watched():
@@ -418,7 +428,7 @@ class ImitationEnv:
 
     def _watched(self) -> bool:
         """Whether the goal has changed by what it sees of the characters."""
-        if type(self.goal).watch is Goal.watch:
+        if not self.goal.watches:
             return False
         sim = self.here()
         if changed := self.goal.watch(self.backend.state.qpos, sim.pos, sim.linvel):
@@ -462,10 +472,17 @@ class ImitationEnv:
     def _observe(self) -> Tensor:
         return self._terms.observe(self._sources.of(self._told())).clone()
 
-    @property
-    def obs_widths(self) -> dict[str, int]:
-        """How many numbers each term of the observation gives, by name and in order."""
-        return self._terms.widths(self._frame())
+    @cached_property
+    def columns(self) -> dict[str, slice]:
+        """The columns of the observations by name, in order: those of each term, such as
+        "rotation_goal", and of its parts, such as "rotation_goal.linvel", see `ObsTerm.parts`."""
+        out, frame = dict[str, slice](), self._frame()
+        first = 0
+        for term in self._terms.obs:
+            width = seen_by((term,), frame).shape[1]
+            out |= term.columns(first, width)
+            first += width
+        return out
 
     # --- motion prior -------------------------------------------------------------------------
 
@@ -482,9 +499,8 @@ class ImitationEnv:
         """`(n, count, F)` of the clips up to the starts of the new episodes in `rows (n,)`; NaN where a
         clip begins later, None if all do."""
         past = self._clip_features.past(self.clip[rows], self.frame[rows], count)
-        for plugin in self.plugins:
-            if past is not None and (without := plugin.past(rows)) is not None:
-                past[without] = torch.nan
+        if past is not None and self.recovery is not None:
+            past[self.recovery.past(rows)] = torch.nan
         return past
 
     def demos(self, frames: int) -> ClipWindows:
@@ -525,8 +541,7 @@ class ImitationEnv:
         self._put(None)
 
     def _put(self, rows: Tensor | None) -> None:
-        for plugin in self._placing:
-            plugin.placed(rows)
+        self._look(rows)
         self.goal.aim(None, self._held())
 
     def close(self) -> None:

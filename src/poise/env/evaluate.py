@@ -165,8 +165,7 @@ class Terms:
         style: what a motion prior sees, none for none.
         observables: what frames know, by name.
         context: what all frames share.
-        ends: which episodes failed, are terminated and are truncated, by a frame and what the terms call
-            a failure.
+        horizon: control steps until an episode times out.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
 
@@ -178,12 +177,12 @@ class Terms:
         style: tuple[ObsTerm, ...],
         observables: Mapping[str, Observable],
         context: Context,
-        ends: Callable[[Frame, Tensor], tuple[Tensor, Tensor, Tensor]],
+        horizon: int,
         device: torch.device,
         fused: bool = True,
     ):
         self.obs, self.rewards, self.dones, self.style = obs, rewards, dones, style
-        self.observables, self.context, self.ends = observables, context, ends
+        self.observables, self.context, self.horizon = observables, context, horizon
         self.fused = fused
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
         shares = [[t.weight, t.weight * t.imitation] for t in rewards]
@@ -240,12 +239,19 @@ class Terms:
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         scores = torch.cat((self._weights @ values, values))
-        ends = torch.stack(self.ends(frame, failed))
-        return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
+        return seen_by(self.obs, frame), scores, self.ends(frame, failed), seen_by(self.style, frame)
 
-    def widths(self, frame: Frame) -> dict[str, int]:
-        """How many numbers each observation gives, by name and in order."""
-        return {term.name: seen_by((term,), frame).shape[1] for term in self.obs}
+    def ends(self, frame: Frame, failed: Tensor) -> Tensor:
+        """`(3, N)` bool, episodes that failed, are terminated and are truncated."""
+        # A clip that is done to its end is a finished task, and its remaining return is stated: as many
+        # steps like the last as `completion_bonus` says, since with nothing to come the last steps
+        # would not matter and characters would fall in them. To bootstrap there would rest on a state
+        # with a value that is never learned, and the policy comes to exploit it.
+        done = frame.place.end > 0
+        if frame.spared is not None:
+            failed, done = failed & ~frame.spared, done & ~frame.spared
+        terminated = failed | done
+        return torch.stack((failed, terminated, (frame.source("age") >= self.horizon) & ~terminated))
 
     def check(self, sources: Mapping[str, Tensor], worlds: int) -> None:
         """Evaluates every term once, and names one that gives what it must not.

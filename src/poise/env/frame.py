@@ -127,7 +127,7 @@ class PointGoal(NamedTuple):
 class Frame:
     """Everything that a term may use, looked up by name when a term first asks for it, and kept.
 
-    A name is that of an observable: a function of the frame in `env.frame`, in a plug-in, or in
+    A name is that of an observable: a function of the frame in `env.frame`, in an event, or in
     `TaskConfig.observables`. An observable reads tensors through `source`, or other observables.
 
     The observables that every task has:
@@ -146,6 +146,7 @@ class Frame:
             step, and at its begin.
         linvel_before: `(N, B, 3)` m/s, velocities of the bodies less the reference's at its begin.
         point: where the reference's root is, in a task with recovery; else None.
+        spared: `(N,)` bool, episodes that cannot end in this step; None: none is spared.
         sizes: `(N, K)` of each character's body, see `phc_obs.shape_of`; None where all have one.
     """
 
@@ -164,6 +165,7 @@ class Frame:
     torque_before: Tensor | None
     linvel_before: Tensor
     point: PointGoal | None
+    spared: Tensor | None
     sizes: Tensor | None
     #: What frames of one environment share, see `env.frame.Context`.
     context: Any
@@ -188,7 +190,7 @@ class Frame:
 
     def source(self, name: str) -> Tensor:
         """A tensor by its name: a field of MuJoCo's state such as "qfrc_constraint" `(N, ...)`, the
-        "action" `(N, A)`, the "age" `(N,)`, or a column of a plug-in."""
+        "action" `(N, A)`, the "age" `(N,)`, or a column of an event."""
         return self._sources[name]
 
     def __getattr__(self, name: str) -> Any:
@@ -219,11 +221,27 @@ TermFunction = Callable[..., Tensor]
 
 @dataclass(frozen=True)
 class ObsTerm:
-    """`fn(frame, **params)` gives `(N, k)` observations."""
+    """`fn(frame, **params)` gives `(N, k)` observations.
+
+    Attributes:
+        parts: names of its columns in order, and how many of every `sum(parts.values())` each has:
+            {"pos": 3, "linvel": 3} of B bodies is "pos" in the first 3 B columns and "linvel" in the
+            others. See `ImitationEnv.columns`.
+    """
 
     name: str
     fn: TermFunction
     params: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    parts: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    def columns(self, first: int, width: int) -> dict[str, slice]:
+        """Its columns and those of its parts, by name, where it has `width` columns from `first` on."""
+        out, many = {self.name: slice(first, first + width)}, sum(self.parts.values())
+        for name, share in self.parts.items():
+            size = share * width // many
+            out[f"{self.name}.{name}"] = slice(first, first + size)
+            first += size
+        return out
 
 
 @dataclass(frozen=True)
@@ -405,7 +423,12 @@ def linvel_before(frame: Frame) -> Tensor:
 
 
 def point(frame: Frame) -> PointGoal | None:
-    """Where the reference's root is; the recovery plug-in says it."""
+    """Where the reference's root is; the recovery event says it."""
+    return None
+
+
+def spared(frame: Frame) -> Tensor | None:
+    """`(N,)` bool, episodes that cannot end in this step; the recovery says them."""
     return None
 
 

@@ -114,6 +114,8 @@ class GeneratorGoal(BufferedGoal):
         reached: (world, control step) of every target that was.
     """
 
+    watches = True
+
     def __init__(
         self,
         generator: MotionGenerator,
@@ -151,8 +153,9 @@ class GeneratorGoal(BufferedGoal):
 
     # --- episodes -----------------------------------------------------------------------------
 
-    def draw(self, ids: Tensor) -> None:
+    def reset(self, ids: Tensor | None, clip: Tensor | None = None, frame: Tensor | None = None) -> None:
         """New motions in worlds `ids`."""
+        ids = self._begun(ids, clip)
         g = self.generator
         frames = g.begin(len(ids), self.rng) if self.pasts is None else self.pasts[ids].clone()
         want = (len(ids), g.past, self.humanoid.model.nq)

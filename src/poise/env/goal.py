@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.bins import Outcomes
 from poise.env.frame import PoseLayout
 from poise.env.reference import Reference, Start
 from poise.env.starts import Starts
@@ -23,14 +22,40 @@ FADE_S = 0.1
 Group = Literal["all", "clip", "bin"]
 
 
-class Goal(ABC):
-    """What N characters are to do.
+class State:
+    """Something with a state that snapshots and checkpoints copy."""
+
+    def rows(self) -> dict[str, Tensor]:
+        """Its knowledge of each world, `(N, ...)` by name: tensors that a snapshot copies in place."""
+        return {}
+
+    def shared(self) -> dict[str, Tensor]:
+        """Tables that `rows` point into, by name: never changed in place; a snapshot holds them."""
+        return {}
+
+    def load_shared(self, shared: Mapping[str, Tensor]) -> None:
+        """Takes what another one of the kind has as `shared()`, for all worlds."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a bit-exact continuation needs, by names that nothing else has."""
+        return {name: value.clone() for name, value in self.rows().items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from `state()`; what is not in there stays as it is."""
+        for name, value in self.rows().items():
+            if name in state:
+                value.copy_(state[name])
+
+
+class Goal(State, ABC):
+    """The motion that N characters are to do, told as it goes.
 
     Attributes:
         humanoid: the goal is in its coordinates; the first of `bodies`.
         bodies: all bodies, of the same joints and hinges.
         rate_hz: control steps a second.
         layout: where the numbers of packed poses `(N, W)` stand, see `PoseLayout`.
+        local: `(N, J, 4)` wxyz local turns of the hinged bodies of coordinates `(N, 7 + n)`.
         num_envs: N.
         device: where its tensors are.
         rng: of all draws that starts make, on the CPU.
@@ -41,33 +66,29 @@ class Goal(ABC):
     bodies: tuple[Humanoid, ...]
     rate_hz: float
     layout: PoseLayout
+    local: Callable[[Tensor], Tensor]
     num_envs: int
     device: torch.device
     rng: torch.Generator
     notes: list[str]
     #: Whether the goal is known before the first episode, so that characters can be set down on it.
     begins: bool = False
-
-    @abstractmethod
-    def local(self, qpos: Tensor) -> Tensor:
-        """`(N, J, 4)` wxyz local turns of the hinged bodies of `qpos (N, 7 + n)`, on `device`."""
+    #: Whether it looks where characters are, see `watch`.
+    watches: bool = False
 
     # --- episodes -----------------------------------------------------------------------------
 
     @abstractmethod
-    def draw(self, ids: Tensor) -> None:
-        """Chooses what the worlds `ids (n,)` are to do in their next episodes."""
-
-    def seek(self, clip: Tensor, frame: Tensor) -> None:
-        """World i goes on at `frame[i]` of `clip[i]`, both `(N,)`, wherever its character stands.
+    def reset(self, ids: Tensor | None, clip: Tensor | None = None, frame: Tensor | None = None) -> None:
+        """New episodes in worlds `ids (n,)`, all for None, as they are drawn; or at `frame (n,)` of
+        `clip (n,)`, wherever the characters stand.
 
         Raises:
-            PoiseError: the goal follows no clips.
+            PoiseError: a clip is given, and the goal follows none.
         """
-        self.clips.seek(clip, frame)
 
     @abstractmethod
-    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+    def start(self, ids: Tensor | None = None, later: int = 0) -> Start:
         """Coordinates of the goal in worlds `ids`, all for None, in which episodes begin; or those of so
         many control steps later."""
 
@@ -78,20 +99,12 @@ class Goal(ABC):
         held: `(N,)` bool, worlds with goals that wait in the next step; None: no goal waits.
         """
 
-    def body(self, ids: Tensor | None) -> Tensor:
-        """`(n,)` which of `bodies` the characters of worlds `ids` need."""
-        count = self.num_envs if ids is None else len(ids)
-        return torch.zeros(count, dtype=torch.long, device=self.device)
-
     # --- frames -------------------------------------------------------------------------------
 
     @abstractmethod
-    def now(self, ids: Tensor | None = None) -> Tensor:
-        """Packed poses `(n, W)` that the characters are to be in now."""
-
-    @abstractmethod
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
-        """Packed poses `(n, W)` of k control steps later; extrapolated where they are not known."""
+        """Packed poses `(n, W)` of k control steps later; extrapolated where they are not known. 0 is
+        where the characters are to be now."""
 
     def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
         """Packed poses `(n, K, W)` of so many control steps later; what a stream does not know yet is
@@ -116,27 +129,11 @@ class Goal(ABC):
         """
         return False
 
-    # --- what is counted ----------------------------------------------------------------------
+    # --- what every goal can be asked ---------------------------------------------------------
 
-    def groups(self, by: Group) -> int:
-        """How many groups of outcomes there are, see `HelpBudget`."""
-        return 1
-
-    def group(self, by: Group) -> Tensor:
-        """`(N,)` the group of each world in the present step."""
-        return torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-
-    def row(self) -> Tensor:
-        """`(N,)` where in the goal's own table the worlds are, for `outcomes`."""
-        return torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-
-    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
-        """What a step that led to `row (N,)` says of motion bins, see `MotionBins.outcomes`."""
-        raise PoiseError(
-            "this goal has no motion bins",
-            hint="Take help_by='all' and adaptive=0",
-            code="goal-without-clips",
-        )
+    def now(self, ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, W)` that the characters are to be in now."""
+        return self.ahead(0, ids)
 
     @property
     def clips(self) -> ClipGoal:
@@ -148,31 +145,18 @@ class Goal(ABC):
         raise PoiseError(f"a {type(self).__name__} follows no clips", code="goal-without-clips")
 
     def where(self, env: int) -> str:
-        """Which part of the goal world `env` is at, for messages."""
+        """The part of the goal that world `env` is at, for messages."""
         return type(self).__name__
 
     # --- persistence --------------------------------------------------------------------------
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a bit-exact continuation needs."""
         return {**{f"goal/{k}": v.clone() for k, v in self.rows().items()}, "rng": self.rng.get_state()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from `state()`."""
         for name, value in self.rows().items():
             value.copy_(state[f"goal/{name}"])
         self.rng.set_state(state["rng"])
-
-    @abstractmethod
-    def rows(self) -> dict[str, Tensor]:
-        """What it knows of each world, `(N, ...)` by name: tensors that a snapshot copies in place."""
-
-    def shared(self) -> dict[str, Tensor]:
-        """What `rows` points into, by name: never changed in place, so that a snapshot holds it."""
-        return {}
-
-    def load_shared(self, shared: Mapping[str, Tensor]) -> None:  # noqa: B027 - most share nothing
-        """Takes what another goal of the kind has as `shared()`, for all worlds."""
 
 
 def extrapolated(qpos: Tensor, qvel: Tensor, steps: Tensor, rate_hz: float) -> Start:
@@ -204,7 +188,7 @@ class ClipGoal(Goal):
     def __init__(self, reference: Reference, num_envs: int, device: torch.device, starts: Starts):
         self.reference = reference = reference.to(device)
         self.humanoid, self.bodies = reference.humanoid, reference.bodies
-        self.rate_hz, self.layout = reference.rate_hz, reference.layout
+        self.rate_hz, self.layout, self.local = reference.rate_hz, reference.layout, reference.local
         self.num_envs, self.device, self.starts = num_envs, device, starts
         self.rng, self.notes = starts.rng, []
         self.odds: Callable[[], Tensor] | None = None
@@ -219,25 +203,19 @@ class ClipGoal(Goal):
     def clips(self) -> ClipGoal:
         return self
 
-    def local(self, qpos: Tensor) -> Tensor:
-        return self.reference.local(qpos)
-
     def drawn(self, by: Group) -> Tensor:
         """`(G,)` bool, groups of clips that episodes draw."""
         used = self.starts.weights > 0
         return used[self.reference.bins.clip.cpu()] if by == "bin" else used
 
-    def draw(self, ids: Tensor) -> None:
-        odds = None if self.odds is None else self.odds()
-        pick, frame = (x.to(self.device) for x in self.starts.draw(len(ids), odds))
-        self.clip[ids], self.frame[ids] = pick, frame
+    def reset(self, ids: Tensor | None, clip: Tensor | None = None, frame: Tensor | None = None) -> None:
+        rows = slice(None) if ids is None else ids
+        if clip is None or frame is None:
+            odds = None if self.odds is None else self.odds()
+            clip, frame = self.starts.draw(self.num_envs if ids is None else len(ids), odds)
+        self.clip[rows], self.frame[rows] = clip.to(self.device), frame.to(self.device)
 
-    def seek(self, clip: Tensor, frame: Tensor) -> None:
-        """World i goes on at `frame[i]` of `clip[i]`, both `(N,)`, wherever its character stands."""
-        self.clip.copy_(clip)
-        self.frame.copy_(frame)
-
-    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+    def start(self, ids: Tensor | None = None, later: int = 0) -> Start:
         clip, frame = (self.clip, self.frame) if ids is None else (self.clip[ids], self.frame[ids])
         return self.reference.coordinates(clip, frame + later)
 
@@ -252,18 +230,15 @@ class ClipGoal(Goal):
             self._ahead[ids] = self.reference.gather_packed(clip, ahead, told=True)
 
     def body(self, ids: Tensor | None) -> Tensor:
+        """`(n,)` which of `bodies` the characters of worlds `ids` need."""
         return self.reference.body[self.clip if ids is None else self.clip[ids]]
-
-    def now(self, ids: Tensor | None = None) -> Tensor:
-        if ids is None:
-            return self.reference.gather_packed(self.clip, self.frame)
-        return self.reference.gather_packed(self.clip[ids], self.frame[ids])
 
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         if k == 1:
             return self._ahead if ids is None else self._ahead[ids]
         clip, frame = (self.clip, self.frame) if ids is None else (self.clip[ids], self.frame[ids])
-        return self.reference.gather_packed(clip, frame + k, told=True)
+        # Noise misleads what is to come, and never the judgement of what was done.
+        return self.reference.gather_packed(clip, frame + k, told=k > 0)
 
     def targets(self) -> tuple[Tensor, Tensor]:
         return self.reference.hinges, self._rows
@@ -279,16 +254,17 @@ class ClipGoal(Goal):
         return now, self._ahead
 
     def groups(self, by: Group) -> int:
+        """How many groups of outcomes there are, see `HelpBudget`."""
         return {"all": 1, "clip": len(self.reference.length), "bin": len(self.reference.bins)}[by]
 
     def group(self, by: Group) -> Tensor:
+        """`(N,)` the group of each world in the present step, of clips or bins."""
         return self.reference.bins.of[self._rows] if by == "bin" else self.clip
 
+    @property
     def row(self) -> Tensor:
+        """`(N,)` the rows of the reference that the present step leads to."""
         return self._rows
-
-    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
-        return self.reference.bins.outcomes(row, age, failed, done)
 
     def where(self, env: int) -> str:
         return f"{self.reference.names[int(self.clip[env])]} frame {int(self.frame[env])}"
@@ -303,7 +279,7 @@ class ClipGoal(Goal):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         self._check(state["clip"], state["frame"])
-        self.seek(state["clip"], state["frame"])
+        self.reset(None, state["clip"], state["frame"])
         if "weights" in state:  # States of former versions are without; their odds never changed.
             self.starts.weights = state["weights"]
         self.rng.set_state(state["rng"])

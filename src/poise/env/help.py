@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from poise.control import HelpSchedule
-from poise.env.goal import Group
-from poise.env.plugins import EpisodesEnded, Plugin
+from poise.env.events import Event, StepOutcome
+from poise.env.goal import Goal, Group
 from poise.errors import PoiseError
 
 #: How much older episodes count, at each decision, against the ones since the last.
@@ -23,7 +23,7 @@ KEPT = 0.8
 EPISODES = 5.0
 
 
-class HelpBudget(Plugin):
+class HelpBudget(Event):
     """Scales the residual force's limits by what a schedule decides from the episodes' outcomes.
 
     With several groups, which are clips or motion bins, each has a scale of its own, decided from the
@@ -96,13 +96,17 @@ class HelpBudget(Plugin):
         where no group in use is helped."""
         return self.now if self.groups == 1 or self.now == 0.0 else torch.tensor(self._scales)
 
-    def at(self, group: Tensor) -> Tensor:
-        """The scale of worlds that belong to `group (N,)`: `(N,)`, or 0-dimensional for one group."""
-        return self.scale if self.groups == 1 else self.scale[group]
+    def group(self, goal: Goal) -> Tensor | None:
+        """`(N,)` the group that each world belongs to in the present step; None where all are one."""
+        return None if self.groups == 1 else goal.clips.group(self.by)
 
-    def limit(self, most: float, group: Tensor) -> float | Tensor:
+    def at(self, group: Tensor | None) -> Tensor:
+        """The scale of worlds that belong to `group (N,)`: `(N,)`, or 0-dimensional for one group."""
+        return self.scale if group is None else self.scale[group]
+
+    def limit(self, most: float, group: Tensor | None) -> float | Tensor:
         """What is left of a limit: a number, or for worlds of different groups `(N,)`."""
-        return self.now * most if self.groups == 1 or self.now == 0.0 else self.at(group) * most
+        return self.now * most if group is None or self.now == 0.0 else self.at(group) * most
 
     @property
     def success(self) -> float:
@@ -110,14 +114,15 @@ class HelpBudget(Plugin):
         ended, failed = self._counts.sum(1).tolist()
         return 1.0 - failed / ended if ended else float("nan")
 
-    def count(self, ended: EpisodesEnded) -> None:
+    def count(self, outcome: StepOutcome) -> None:
         if self.schedule is None:
             return
         if self.by == "bin":
-            self.add(*ended.bins)
+            self.add(*outcome.bins)
         else:
-            failed = ended.failed[ended.ids].double()
-            self.add(ended.goal.group(self.by)[ended.ids], torch.ones_like(failed), failed)
+            ids, group = outcome.ids, self.group(outcome.goal)
+            failed = outcome.ends[0, ids].double()
+            self.add(ids if group is None else group[ids], torch.ones_like(failed), failed)
 
     def add(self, group: Tensor, ended: Tensor, failed: Tensor) -> None:
         """One control step in which `ended (n,)` outcomes of `group (n,)`, 1 or 0 each, became known,

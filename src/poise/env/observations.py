@@ -103,6 +103,11 @@ def self_state(frame: Frame) -> Tensor:
     return torch.cat((sim.pos[:, 0, 2:], into_heading(sim.heading, vectors).flatten(1)), -1)
 
 
+#: The columns of `rotation_goal` and of `keypoint_goal`, of each body.
+ROTATION_PARTS = {"pos": 3, "linvel": 3, "angvel": 3, "place": 3, "rot": 6, "turn": 6}
+KEYPOINT_PARTS = {"pos": 3, "linvel": 3, "place": 3}
+
+
 def rotation_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
     """s^g-rot = (th^ - th, p^ - p, v^ - v, w^ - w, th^, p^) of every body `(N, 24 K)`.
 
@@ -135,13 +140,6 @@ def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
     target, moves = _rows(goal.pos, bodies), _rows(goal.linvel, bodies) - _rows(sim.linvel, bodies)
     places = torch.cat((target - _rows(sim.pos, bodies), moves, target - sim.pos[:, :1]), 1)
     return into_heading(sim.heading, places).flatten(1)
-
-
-def velocity_columns(bodies: int, shape: bool, rotations: bool) -> tuple[int, int]:
-    """First column of v^ - v and, with rotations, w^ - w, and the first after them, where a policy
-    observes `self_state`, `shape` or not, and then `rotation_goal` or `keypoint_goal` of all bodies."""
-    first = 15 * bodies - 2 + (2 * bodies - 1 if shape else 0) + 3 * bodies
-    return first, first + (6 if rotations else 3) * bodies
 
 
 def goal_later(frame: Frame, step: int, bodies: Tensor, turns: bool = True) -> Tensor:

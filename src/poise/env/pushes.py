@@ -9,9 +9,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from poise.env.events import EpisodeStart, Felt, Force
 from poise.env.goal import Goal
-from poise.env.plugins import Felt, Plugin
-from poise.env.reference import Start
 from poise.errors import PoiseError
 from poise.settings import Checked, Count, Length, Positive, Range, Share
 from poise.sim import Backend, Drive
@@ -19,7 +18,7 @@ from poise.sim import Backend, Drive
 
 @dataclass(frozen=True)
 class Push(Checked):
-    """A constant force on one body for some time of each episode; given to `TaskConfig.plugins`.
+    """A constant force on one body for some time of each episode; given to `TaskConfig.events`.
 
     Attributes:
         row: of the body table; the force acts at the body's inertial centre.
@@ -38,7 +37,7 @@ class Push(Checked):
     foreseen: bool = True
 
     def __call__(self, goal: Goal, backend: Backend) -> OnePush:
-        """The plug-in of an environment."""
+        """The event of an environment."""
         bodies = len(goal.humanoid.bodies)
         if self.row >= bodies:
             raise PoiseError(
@@ -47,7 +46,7 @@ class Push(Checked):
         return OnePush(self, backend)
 
 
-class OnePush(Plugin):
+class OnePush(Force):
     """The push on the characters of a backend.
 
     Attributes:
@@ -63,17 +62,15 @@ class OnePush(Plugin):
         self._force = torch.tensor(push.force).to(backend.drive.xfrc_applied)
         self._know()
 
-    def start(
-        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
-    ) -> Start:
+    def begin(self, episodes: EpisodeStart) -> None:
         """Episodes begin before the push."""
-        self.step[slice(None) if ids is None else ids] = 0
+        self.step[episodes.rows] = 0
         self._know()
-        return start
 
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """Adds the force."""
         drive.xfrc_applied[self.acts, self.given.row + 1, :3] += self._force
+        return False
 
     def felt(self) -> Felt:
         """The push, where it acts."""
@@ -82,23 +79,13 @@ class OnePush(Plugin):
         force = self._force * self.acts.unsqueeze(1)
         return Felt(rows, self._backend.state.xipos[:, body : body + 1], force.unsqueeze(1))
 
-    def tick(self) -> None:
+    def after_step(self) -> None:
         """Counts on."""
         self.step += 1
         self._know()
 
     def rows(self) -> dict[str, Tensor]:
         return {"one push/step": self.step, "one push/acts": self.acts}
-
-    def state(self) -> dict[str, Tensor]:
-        """Where the episodes are."""
-        return {k: v.clone() for k, v in self.rows().items()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on from there; from a task without this push from the begin of its time."""
-        for name, value in self.rows().items():
-            if name in state:
-                value.copy_(state[name])
 
     def _know(self) -> None:
         if self.given.foreseen:
@@ -113,7 +100,7 @@ NEVER = 10**9
 @dataclass(frozen=True)
 class Pushes(Checked):
     """Pushes on random bodies at random times, each of a random horizontal direction; given to
-    `TaskConfig.plugins`.
+    `TaskConfig.events`.
 
     Attributes:
         newtons: between which the force is drawn, N.
@@ -142,11 +129,11 @@ class Pushes(Checked):
         return given if isinstance(given, tuple) else (given, given)
 
     def __call__(self, goal: Goal, backend: Backend) -> Pushing:
-        """The plug-in of an environment."""
+        """The event of an environment."""
         return Pushing(self, backend)
 
 
-class Pushing(Plugin):
+class Pushing(Force):
     """The pushes on the characters of a backend.
 
     Attributes:
@@ -171,21 +158,19 @@ class Pushing(Plugin):
         """`(N,)` bool, characters that are pushed in this control step."""
         return self.left <= 0
 
-    def start(
-        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
-    ) -> Start:
+    def begin(self, episodes: EpisodeStart) -> None:
         """Episodes begin with a time without a push; some have none at all."""
-        rows = torch.arange(len(self.left), device=self.left.device) if ids is None else ids
+        rows = torch.arange(len(self.left), device=self.left.device)[episodes.rows]
         self._draw(rows)
         if self.pushes.share < 1.0:
             none = torch.rand(len(rows), generator=self._rng) >= self.pushes.share
             self.left[rows[none.to(rows.device)]] = NEVER
-        return start
 
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """Adds the force of each push."""
         rows = self.acting.nonzero().squeeze(-1)
         drive.xfrc_applied[rows, self.body[rows], :3] += self.force[rows]
+        return False
 
     def felt(self) -> Felt:
         """The pushes that act."""
@@ -193,7 +178,7 @@ class Pushing(Plugin):
         point = self._backend.state.xipos.gather(1, self.body.view(-1, 1, 1).expand(-1, 1, 3))
         return Felt(self.body.unsqueeze(1), point, force.unsqueeze(1))
 
-    def tick(self) -> None:
+    def after_step(self) -> None:
         """Counts down, and draws the next push where one is over."""
         self.left -= 1
         self._draw((self.left <= -self.lasts).nonzero().squeeze(-1))
@@ -208,15 +193,12 @@ class Pushing(Plugin):
 
     def state(self) -> dict[str, Tensor]:
         """The pushes, and the generator of those to come."""
-        rows = {k: v.clone() for k, v in self.rows().items()}
-        return {**rows, "push/rng": self._rng.get_state()}
+        return {**super().state(), "push/rng": self._rng.get_state()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on with the same pushes; from a task without pushes with those it has."""
         if "push/rng" in state:
-            for name, value in self.rows().items():
-                if name in state:
-                    value.copy_(state[name])
+            super().load_state(state)
             self._rng.set_state(state["push/rng"])
 
     def _draw(self, ids: Tensor) -> None:

@@ -51,7 +51,7 @@ class BufferedGoal(Goal):
         self.num_envs, self.device, self.size, self.notes = num_envs, device, size, []
         self.rng = torch.Generator().manual_seed(seed)
         # Frames become poses on the CPU; what terms ask for is worked out where the worlds are.
-        self._poser, self._there = Poser(humanoid), Poser(humanoid, device)
+        self._poser, self.local = Poser(humanoid), Poser(humanoid, device).local
         self.layout = self._poser.layout()
         nq, nv = humanoid.model.nq, humanoid.model.nv
         self.qpos = torch.zeros(num_envs, size, nq, dtype=torch.float64, device=device)
@@ -141,14 +141,17 @@ class BufferedGoal(Goal):
 
     # --- what a goal tells --------------------------------------------------------------------
 
-    def local(self, qpos: Tensor) -> Tensor:
-        return self._there.local(qpos)
+    def _begun(self, ids: Tensor | None, clip: Tensor | None) -> Tensor:
+        """The worlds that begin; where a clip is asked for, `clips` says that there are none."""
+        if clip is not None:
+            self.clips.reset(ids, clip)
+        return self._every if ids is None else ids
 
     @abstractmethod
     def supply(self, ids: Tensor) -> None:
         """Frames for worlds `ids (n,)` that are about to be read, as far as there are any."""
 
-    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+    def start(self, ids: Tensor | None = None, later: int = 0) -> Start:
         ids = self._every if ids is None else ids
         return self.coordinates(ids, self.at[ids] + later)
 
@@ -168,10 +171,6 @@ class BufferedGoal(Goal):
         self._ahead[ids] = self.packed(ids, index)
         self._hinges[ids] = self.coordinates(ids, index)[0][:, 7:]
         self._stale[ids] = False
-
-    def now(self, ids: Tensor | None = None) -> Tensor:
-        ids = self._every if ids is None else ids
-        return self.packed(ids, self.at[ids])
 
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         if k == 1:
@@ -335,12 +334,13 @@ class StreamGoal(BufferedGoal):
         self._note(ids, "ended")
         self._stale[ids] = True
 
-    def draw(self, ids: Tensor) -> None:
+    def reset(self, ids: Tensor | None, clip: Tensor | None = None, frame: Tensor | None = None) -> None:
         """A new episode begins at the newest frame.
 
         Raises:
-            PoiseError: nothing has arrived yet.
+            PoiseError: nothing has arrived yet, or a clip is asked for.
         """
+        ids = self._begun(ids, clip)
         self.at[ids] = self.count[ids] - 1
         if bool((self.at[ids] < 0).any()):
             raise PoiseError(

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from poise.control import Compliance, HelpSchedule, PDTargets, Residual, Stiffness, Wrench
+from poise.env.events import AdaptiveSampling, BodyAssignment, Event
 from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
 from poise.env.goal import ClipGoal, Goal
 from poise.env.help import HelpBudget
-from poise.env.plugins import AdaptiveSampling, BodyAssignment, Plugin
 from poise.env.recovery.clock import Recovery, RecoveryClock
 from poise.env.reference import Reference
 from poise.env.starts import Starts
@@ -85,9 +85,9 @@ class TaskConfig:
     compliance: how goals give way where something pushes the characters, see `env.yielding`: by the
         paper's law, or by a commanded stiffness; None: they do not.
     observables: more of what terms can ask a frame for, by name, see `env.frame`.
-    velocities: first column of the observations that tell how far velocities are off the goal's, and the
-        first after them: what a smooth policy shall not answer to (`PPOConfig.smooth_weight`).
-    plugins: make more parts of an environment, each of its goal and backend, see `env.plugins`.
+    velocities: columns of the observations, next to each other, that tell how far velocities are off the
+        goal's: what a smooth policy shall not answer to (`PPOConfig.smooth_weight`).
+    events: make more parts of an environment, each of its goal and backend, see `env.events`.
     """
 
     obs: tuple[ObsTerm, ...]
@@ -111,8 +111,8 @@ class TaskConfig:
     recovery: Recovery | None = None
     compliance: Compliance | Stiffness | None = None
     observables: Mapping[str, Observable] = field(default_factory=dict)
-    velocities: tuple[int, int] | None = None
-    plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
+    velocities: tuple[str, ...] = ()
+    events: tuple[Callable[[Goal, Backend], Event], ...] = ()
 
     def __post_init__(self) -> None:
         validate(self)
@@ -189,15 +189,16 @@ def goal_of(
     return ClipGoal(reference, backend.num_envs, backend.device, starts)
 
 
-def plugins_of(
+def events_of(
     task: TaskConfig, goal: Goal, backend: Backend, seed: int
-) -> tuple[HelpBudget, tuple[Plugin, ...]]:
-    """The budget of help, and the plug-ins of a task in the order in which they are asked."""
+) -> tuple[HelpBudget, tuple[Event, ...]]:
+    """The budget of help, and the events of a task in the order in which they are asked."""
     schedule = task.help if task.auto_reset and task.residual else None
-    budget = HelpBudget(schedule, backend.device, goal.groups(task.help_by), task.help_by)
-    out: list[Plugin] = []
+    groups = 1 if task.help_by == "all" else goal.clips.groups(task.help_by)
+    budget = HelpBudget(schedule, backend.device, groups, task.help_by)
+    out: list[Event] = []
     if task.adaptive and task.auto_reset:
-        sampling = AdaptiveSampling(goal.groups("bin"), backend.device)
+        sampling = AdaptiveSampling(goal.clips.groups("bin"), backend.device)
         goal.clips.odds = lambda: sampling.odds
         out.append(sampling)
     out.append(budget)
@@ -211,11 +212,11 @@ def plugins_of(
             # Falls are those of the first body, which all worlds still have.
             _ = clock.falls
         out.append(BodyAssignment(backend, goal.bodies))
-    own = [make(goal, backend) for make in task.plugins]
-    out += [*([clock] if clock else []), *own]
+    out += [*([clock] if clock else []), *(make(goal, backend) for make in task.events)]
     if task.compliance is not None:
         assert isinstance(goal, DisplacedGoal)
         additive = task.pd.mode == "additive"
+        # The last one, since it gives way to the forces of all others.
         out.append(Yielding(task.compliance, goal, backend, additive, tuple(out)))
     return budget, tuple(out)
 

@@ -23,9 +23,9 @@ from poise.control.compliance import (
     settled,
     softening,
 )
-from poise.env.bins import Outcomes
-from poise.env.goal import ClipGoal, Goal, Group
-from poise.env.plugins import Felt, Plugin
+from poise.env.events import EpisodeStart, Event, Felt, Force
+from poise.env.frame import Observable
+from poise.env.goal import ClipGoal, Goal
 from poise.env.reference import Poser, Start
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
@@ -42,33 +42,30 @@ class DisplacedGoal(Goal):
     """
 
     def __init__(self, goal: Goal, hindsight: bool = False):
-        self.goal, self._hindsight = goal, hindsight
-        self.humanoid, self.bodies, self.rate_hz = goal.humanoid, goal.bodies, goal.rate_hz
-        self.layout, self.num_envs, self.device = goal.layout, goal.num_envs, goal.device
-        self.rng, self.notes, self.begins = goal.rng, goal.notes, goal.begins
+        self.num_envs, self.device, self._hindsight = goal.num_envs, goal.device, hindsight
+        self.follow(goal)
         nv = self.humanoid.model.nv
         self.offset = torch.zeros(self.num_envs, nv, dtype=torch.float64, device=self.device)
         self.rate = torch.zeros_like(self.offset)
         self._poser = Poser(self.humanoid)
         self._every = torch.arange(self.num_envs, device=self.device)
 
-    def local(self, qpos: Tensor) -> Tensor:
-        return self.goal.local(qpos)
+    def follow(self, goal: Goal) -> None:
+        """Displaces another goal of the same body from now on."""
+        self.goal, self.begins, self.watches = goal, goal.begins, goal.watches
+        self.humanoid, self.bodies, self.rate_hz = goal.humanoid, goal.bodies, goal.rate_hz
+        self.layout, self.local, self.rng, self.notes = goal.layout, goal.local, goal.rng, goal.notes
 
     @property
     def clips(self) -> ClipGoal:
         return self.goal.clips
 
-    def draw(self, ids: Tensor) -> None:
-        self.goal.draw(ids)
-        self.offset[ids], self.rate[ids] = 0.0, 0.0
+    def reset(self, ids: Tensor | None, clip: Tensor | None = None, frame: Tensor | None = None) -> None:
+        self.goal.reset(ids, clip, frame)
+        rows = slice(None) if ids is None else ids
+        self.offset[rows], self.rate[rows] = 0.0, 0.0
 
-    def seek(self, clip: Tensor, frame: Tensor) -> None:
-        self.goal.seek(clip, frame)
-        self.offset.zero_()
-        self.rate.zero_()
-
-    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+    def start(self, ids: Tensor | None = None, later: int = 0) -> Start:
         qpos, qvel = self.goal.start(ids, later)
         rows = self._every if ids is None else ids
         return displaced(qpos, self.offset[rows]), qvel + self.rate[rows]
@@ -76,15 +73,9 @@ class DisplacedGoal(Goal):
     def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
         self.goal.aim(ids, held)
 
-    def body(self, ids: Tensor | None) -> Tensor:
-        return self.goal.body(ids)
-
-    def now(self, ids: Tensor | None = None) -> Tensor:
-        now = self.goal.now(ids)
-        return now if self._hindsight else self._moved(now, ids)
-
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
-        return self._moved(self.goal.ahead(k, ids), ids)
+        packed = self.goal.ahead(k, ids)
+        return packed if self._hindsight and not k else self._moved(packed, ids)
 
     def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
         return self._moved_all(self.goal.window(steps, ids), ids)
@@ -102,18 +93,6 @@ class DisplacedGoal(Goal):
 
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
         return self.goal.watch(qpos, pos, linvel)
-
-    def groups(self, by: Group) -> int:
-        return self.goal.groups(by)
-
-    def group(self, by: Group) -> Tensor:
-        return self.goal.group(by)
-
-    def row(self) -> Tensor:
-        return self.goal.row()
-
-    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
-        return self.goal.outcomes(row, age, failed, done)
 
     def where(self, env: int) -> str:
         return self.goal.where(env)
@@ -161,10 +140,10 @@ MOST = 4
 LEAST = 1e-9
 
 
-class Yielding(Plugin):
+class Yielding(Event):
     """Displaces the goals of N characters where something pushes them (`TaskConfig.compliance`).
 
-    Before each physics step the forces that other plug-ins tell (`Plugin.felt`) move
+    Before each physics step the forces that other events tell (`Force.felt`) move
     `DisplacedGoal.offset`, u. A policy sees the displaced goal; where actions add to the goal's joint
     angles, what u has moved since the control step began is added to the targets, too. Where nothing
     acts u goes back to 0.
@@ -183,13 +162,13 @@ class Yielding(Plugin):
         goal: DisplacedGoal,
         backend: Backend,
         additive: bool,
-        others: Sequence[Plugin],
+        others: Sequence[Event],
     ):
         self.given, self.goal, self._backend, self._additive = given, goal, backend, additive
         table, here = goal.humanoid.table, backend.device
         self._weights = columns(table, given.weights, given.root).to(here)
         self._shares = torch.ones_like(self._weights)
-        self._felt = [p for p in others if type(p).felt is not Plugin.felt]
+        self._felt = [event for event in others if isinstance(event, Force)]
         self._mechanics = Mechanics(backend, inertia=False)
         if isinstance(given, Compliance):
             # The root has no share of its own.
@@ -228,37 +207,22 @@ class Yielding(Plugin):
             allowed.check(float(value), name)
         self.level[slice(None) if rows is None else rows] = level
 
-    def follow(self, goal: Goal) -> None:
-        """What displaces the former goal does so with the new one, from nothing."""
-        assert isinstance(goal, DisplacedGoal)
-        self.goal = goal
-
-    def sources(self) -> Mapping[str, Tensor]:
+    def tells(self) -> Mapping[str, Tensor | Observable]:
         """u and the dial, for terms of a policy that learns with them."""
         return {"compliance/u": self.goal.offset, "compliance/level": self.level}
 
-    def start(
-        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
-    ) -> Start:
+    def begin(self, episodes: EpisodeStart) -> None:
         """Draws the levels of new episodes, where they are drawn."""
         if isinstance(self.given, Compliance) and self.given.drawn is not None:
-            rows, (low, high) = self._rows[:, 0] if ids is None else ids, self.given.drawn
-            drawn = torch.rand(len(rows), generator=rng, dtype=torch.float64).to(self.level.device)
-            self.level[rows] = low + (high - low) * drawn
-        return start
+            rows = self._rows[:, 0] if episodes.ids is None else episodes.ids
+            low, high = self.given.drawn
+            drawn = torch.rand(len(rows), generator=episodes.rng, dtype=torch.float64)
+            self.level[rows] = low + (high - low) * drawn.to(self.level.device)
 
     def rows(self) -> dict[str, Tensor]:
         return {"compliance/level": self.level}
 
-    def state(self) -> dict[str, Tensor]:
-        return {"compliance/level": self.level.clone()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on at the same levels; from a task without compliance at those it has."""
-        if "compliance/level" in state:
-            self.level.copy_(state["compliance/level"])
-
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """A control step begins; what is left of u is nothing once it is too small to be seen."""
         u, rate = self.goal.offset, self.goal.rate
         gone = (u.abs().amax(1, True) < LEAST) & (rate.abs().amax(1, True) < LEAST)
@@ -266,6 +230,7 @@ class Yielding(Plugin):
         rate.masked_fill_(gone, 0.0)
         self._before.copy_(self.goal.offset)
         self._k, self._looked = 0, False
+        return self._busy()
 
     def _look(self) -> None:
         """What the goal is in this control step, once something moves u: it takes as long as a quarter
@@ -279,23 +244,23 @@ class Yielding(Plugin):
         self._least = torch.minimum(self._low, hinges) - hinges
         self._most = torch.maximum(self._high, hinges) - hinges
 
-    def busy(self) -> bool:
+    def _busy(self) -> bool:
         """Whether u may move: it is not 0, or a force acts or may come where the dial is not at 0."""
         if bool((self.goal.offset != 0.0).any() or (self.goal.rate != 0.0).any()):
             return True
         if isinstance(self.given, Compliance) and not bool((self.level > 0.0).any()):
             return False
-        for plugin in self._felt:
-            felt = plugin.felt()
+        for event in self._felt:
+            felt = event.felt()
             if felt is None:
                 continue
             # What is no part of the drive, or is told anew at each physics step, may come in between.
-            held = felt.driven and type(plugin).push_substep is Plugin.push_substep
+            held = felt.driven and felt.steady
             if not held or bool((felt.force.norm(dim=-1) >= self.given.least_n).any()):
                 return True
         return False
 
-    def push_substep(self, drive: Drive) -> None:
+    def before_substep(self, drive: Drive) -> None:
         """Moves u over the physics step that comes, and the targets with it."""
         felt = [f for f in (p.felt() for p in self._felt) if f is not None]
         self._move(felt)

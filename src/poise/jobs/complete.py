@@ -25,7 +25,7 @@ from poise.jobs.track.in_place import with_travel
 from poise.jobs.tracker import Tracker
 from poise.kinematics import without_noise
 from poise.kinematics.rate import judge_rate
-from poise.learn.inbetween import InbetweenModel
+from poise.learn.inbetween_model import InbetweenModel
 from poise.motion import Clip
 from poise.plan import LookaheadConfig
 from poise.settings import changed

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from poise.formats import home_suffix
-from poise.jobs.runs import Evaluation
 from poise.kinematics import anatomy_of, examine, hold_feet, lowest_height, qpos_to_clip, support_of
 from poise.kinematics.feet import stands_higher
 from poise.kinematics.hold import FASTEST, mend_slides
@@ -31,6 +30,19 @@ from poise.version import __version__
 #: By how much the largest jerk may grow with a foot that is held; s around where it slides that are
 #: looked at; how often what is rougher is left out.
 ROUGHER, AROUND_S, ROUNDS = 1.25, 0.5, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What a policy did: the score card, the padded rollouts, one whole episode per clip.
+
+    together: whether these are characters of one world.
+    """
+
+    card: ScoreCard
+    rollouts: RolloutSet
+    recordings: list[Recording]
+    together: bool = False
 
 
 def as_file(clip: Clip) -> Clip:

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from poise.errors import PoiseError
-from poise.jobs.keep import claimed
+from poise.jobs.keep import EVALUATING, claimed
 from poise.jobs.open import Run, open_run
-from poise.jobs.practice import EVALUATING, Watching, practise
+from poise.jobs.practice import Watching, practise
 from poise.jobs.result import RUN, Result, clip_of
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track.in_place import with_travel
-from poise.jobs.track.settings import Mode
+from poise.jobs.track_settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, RunResult, Until

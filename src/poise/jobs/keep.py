@@ -9,6 +9,8 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 
+#: What a job does last, as `Watching.doing` is told it.
+EVALUATING = "simulating every start frame"
 #: What `imitate` and `track` write into their folder.
 _RESULTS = (
     "simulated.*", "simulated_*.*", "body.bvh", "score.json", "report.html", "simulation.safetensors",

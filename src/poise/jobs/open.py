@@ -18,7 +18,7 @@ import torch
 
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual import perpetual_run
 from poise.jobs.run_file import (
     FINAL,
     RUN_FILE,
@@ -33,7 +33,7 @@ from poise.jobs.runs import Evaluation, evaluate, score, trained_policy, transit
 from poise.jobs.tracker import POLICIES, SHIPPED, Tracker, check_policy_file, load_tracker
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint
 from poise.learn.checkpoint import under
-from poise.learn.inbetween import MODEL, InbetweenModel, load_model
+from poise.learn.inbetween_model import MODEL, InbetweenModel, load_model
 from poise.recipes.perpetual import RECIPE
 from poise.recipes.perpetual import RECIPE as PERPETUAL
 from poise.recipes.perpetual_settings import Perpetual
@@ -243,7 +243,7 @@ def _folder(folder: Path) -> Run:
     tensors, meta = load_checkpoint(path)
     if meta.get("kind") == "inbetween run":
         # It takes longer to import than a policy takes to open.
-        from poise.jobs.inbetween.training import Inbetween
+        from poise.jobs.inbetween.inbetween_training import Inbetween
 
         check_data(InbetweenMeta, meta, path)
         return Run(folder, INBETWEEN, from_data(Inbetween, meta["config"], path))

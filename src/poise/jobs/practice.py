@@ -38,7 +38,7 @@ from poise.jobs.track.learning import (
     with_help,
 )
 from poise.jobs.track.placement import place
-from poise.jobs.track.settings import Mode
+from poise.jobs.track_settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, Until
@@ -47,8 +47,6 @@ from poise.recipes.imitation import Imitation
 
 #: Start frames from which a motion is to be done before its training ends.
 STARTS = 32
-#: What `Watching.doing` is told last.
-EVALUATING = "simulating every start frame"
 #: The share of the minutes that training has at least, whatever looking for the motion takes.
 LEAST = 0.5
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.endless.training import Endless
-from poise.jobs.inbetween.settings import Inbetween, small
+from poise.jobs.endless.endless_training import Endless
+from poise.jobs.inbetween.inbetween_settings import Inbetween, small
 from poise.motion import Clip
 from poise.recipes.perpetual_settings import BY_STAGES
 from poise.recipes.residual_force_settings import ResidualForce

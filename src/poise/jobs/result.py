@@ -17,6 +17,7 @@ from poise.errors import PoiseError
 from poise.formats import check_writable, home_suffix, names_file, write_clip
 from poise.jobs.deliver import (
     Delivery,
+    Evaluation,
     StageMotion,
     as_high_as_source,
     finished,
@@ -37,7 +38,6 @@ from poise.score.report.verdict import percent
 from poise.score.rollouts import RolloutSet
 
 if TYPE_CHECKING:
-    from poise.jobs.runs import Evaluation
     from poise.jobs.track.in_place import InPlace
     from poise.jobs.track.placement import Clean, PlacedMotion
     from poise.jobs.track.pushed import Pushed

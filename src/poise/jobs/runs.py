@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
+from poise.jobs.deliver import Evaluation
 from poise.jobs.run_file import (
     RUN_FILE,
     body_facts,
@@ -39,7 +40,6 @@ from poise.recipes.residual_force_settings import ResidualForce, config_of, most
 from poise.score import (
     TRACKING,
     Nothing,
-    Recording,
     RolloutSet,
     ScoreCard,
     Transitions,
@@ -50,19 +50,6 @@ from poise.score import (
     start_frames,
 )
 from poise.settings import to_data
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """What a policy did: the score card, the padded rollouts, one whole episode per clip.
-
-    together: whether these are characters of one world.
-    """
-
-    card: ScoreCard
-    rollouts: RolloutSet
-    recordings: list[Recording]
-    together: bool = False
 
 
 def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str = "cpu") -> Imitation:

@@ -29,7 +29,6 @@ from poise.learn import PolicyBundle, Value, load_checkpoint, save_checkpoint
 from poise.learn.checkpoint import PolicyMeta, prefixed, under
 from poise.learn.policy import policy_in
 from poise.motion import Clip, trim
-from poise.recipes.perpetual import RECIPE
 from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.settings import check_data, to_data
 from poise.version import __version__
@@ -136,7 +135,7 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
     meta = {
         "kind": KIND,
         "tracker": VERSION,
-        "recipe": RECIPE["name"],
+        "recipe": "perpetual",
         "config": to_data(tracker.config),
         "table": tracker.humanoid.table.to_dict(),
         "example": clip[0],

@@ -200,11 +200,10 @@ def _observed(imitation: Imitation) -> dict[str, Tensor]:
     """The columns of each of a task's observations, by name and in order."""
     env = imitation.env(1, threads=1)
     try:
-        widths = env.obs_widths
+        every = torch.arange(env.num_obs)
+        return {term.name: every[env.columns[term.name]] for term in env.task.obs}
     finally:
         env.close()
-    columns = torch.arange(sum(widths.values())).split(list(widths.values()))
-    return dict(zip(widths, columns, strict=True))
 
 
 def _measure(policy: PolicyBundle, imitation: Imitation, columns: Tensor, steps: int) -> None:

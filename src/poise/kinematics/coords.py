@@ -15,7 +15,6 @@ from poise.motion import Clip, Skeleton
 from poise.motion import quats as q
 from poise.motion.rotations import (
     euler_to_quat,
-    forward_kinematics,
     normalize,
     quat_between,
     quat_conj,
@@ -175,7 +174,7 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
             clip.name,
             code="skeleton-differs",
         )
-    pos, quat = forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *clip.tensors())
+    pos, quat = skeleton.forward(*clip.tensors())
     pelvis = rows[0].joint
     columns = [pos[:, pelvis], unwrap_quats(quat[:, pelvis])]
     for row in rows[1:]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,8 +12,8 @@ from poise.body import find_anatomy
 from poise.errors import PoiseError, did_you_mean
 from poise.kinematics.limbs import match_positions
 from poise.motion import Clip, Skeleton
-from poise.motion.rotations import forward_kinematics, normalize, quat_conj, quat_mul, slerp
-from poise.motion.smoothing import gaussian_sums
+from poise.motion.rotations import normalize, quat_conj, quat_mul, slerp
+from poise.motion.smoothing import gaussian_sums, smoothstep
 
 #: Ends of limbs that can be pinned and can touch; the pelvis, too, can be led to a point.
 LIMBS = ("left_foot", "right_foot", "left_hand", "right_hand")
@@ -85,7 +84,7 @@ def ease(frames: int, first: int, last: int, fps: float, seconds: float = EASE_S
     t = torch.arange(frames, dtype=torch.float64)
     away = torch.maximum(first - t, t - last).clamp_min(0.0) / (seconds * fps)
     left = (1.0 - away).clamp(0.0, 1.0)
-    return left * left * (3.0 - 2.0 * left)
+    return smoothstep(left)
 
 
 def check_asked(clip: Clip, asked: Sequence[Pin | TouchPoint]) -> None:
@@ -176,7 +175,7 @@ def _foot(
         return {}
     of = [joint]
     of += [j for j in range(joint + 1, len(skeleton)) if skeleton.parents[j] in of]
-    world = _world(skeleton, root, rot)[1][span[0] : span[1] + 1, of]
+    world = skeleton.forward(root, rot)[1][span[0] : span[1] + 1, of]
     sides = torch.where((world * world[:1]).sum(-1, keepdim=True) < 0, -world, world)
     return dict(zip(of, normalize(sides.mean(0)), strict=True))
 
@@ -185,7 +184,7 @@ def _still(
     skeleton: Skeleton, root: Tensor, rot: Tensor, still: dict[int, Tensor], share: Tensor
 ) -> Tensor:
     """Rotations with joints turned in the world by a share `(T)` of the way to how they stay."""
-    rot, world = rot.clone(), _world(skeleton, root, rot)[1]
+    rot, world = rot.clone(), skeleton.forward(root, rot)[1]
     for j, turn in still.items():
         wanted = slerp(world[:, j], turn.expand_as(world[:, j]), share)
         above = world[:, skeleton.parents[j]]
@@ -231,12 +230,7 @@ def _pelvis_led(clip: Clip, root: Tensor, rot: Tensor, what: TouchPoint) -> tupl
 
 
 def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:
-    return _world(skeleton, root, rot)[0][:, joint]
-
-
-def _world(skeleton: Skeleton, root: Tensor, rot: Tensor) -> tuple[Tensor, Tensor]:
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
-    return forward_kinematics(skeleton.parents, offsets, root, rot)
+    return skeleton.forward(root, rot)[0][:, joint]
 
 
 def _doubts(

@@ -12,13 +12,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from poise.body import BodyTable, find_anatomy
-from poise.body.table import BodyRow, Geom
+from poise.body.body_table import BodyRow, Geom
 from poise.errors import PoiseError
 from poise.kinematics.forward import carried
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import (
-    forward_kinematics,
     quat_between,
     quat_conj,
     quat_mul,
@@ -222,8 +221,7 @@ UNDER_M = 0.1
 
 def joint_heights(skeleton: Skeleton, motion: Motion) -> Tensor:
     """`(T, J)` m of all joints."""
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
-    return forward_kinematics(skeleton.parents, offsets, *motion)[0][..., 2]
+    return skeleton.forward(*motion)[0][..., 2]
 
 
 def off_floor(skeleton: Skeleton, motion: Motion) -> Tensor:

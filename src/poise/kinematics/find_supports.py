@@ -28,6 +28,10 @@ FRICTION, OF_A_WALL = 0.8, 0.4
 class RequiredWrench:
     """What a motion asks of the world.
 
+    Newton and Euler about the centre of mass c of a body of mass M, its parts' masses m_i at x_i:
+
+        f = M (c'' + g e_z),    tau = d/dt sum_i m_i (x_i - c) x (x_i' - c')
+
     Attributes:
         com: `(T, 3)` m, centre of mass, smoothed.
         force: `(T, 3)` N; torque: `(T, 3)` N m about it; world axes.
@@ -41,6 +45,8 @@ class RequiredWrench:
 
     def missing(self, frame: int, points: np.ndarray, normals: np.ndarray) -> tuple[float, np.ndarray]:
         """What contacts cannot give in a frame, as a share of the weight; and their forces `(K, 3)` N.
+
+        The least of |f - sum f_k| and |tau - sum (p_k - c) x f_k| / `ARM_M` over forces in their cones.
 
         points, normals: `(K, 3)` m and unit vectors toward the body, each the axis of a cone of four
         edges with `FRICTION`, or `OF_A_WALL`.

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
-from poise.body.table import BodyRow
+from poise.body.body_table import BodyRow
 from poise.kinematics.ground import GroundFit
 from poise.kinematics.loops import Cycle
 from poise.kinematics.place import calm_library, on_own_body, place_on_body

@@ -15,18 +15,27 @@ from poise.kinematics.feet import Sole, bearing, dragged, soles_of
 from poise.kinematics.forward import lowest_height
 from poise.kinematics.limbs import limb_of, match_positions
 from poise.kinematics.repair.faults import Fault
-from poise.kinematics.repair.support import FloorPoints, foot_slips
+from poise.kinematics.repair.support import (
+    COMMON_S,
+    LEVEL_SPEED,
+    RISE_SPEED,
+    ROLL_SPEED,
+    FloorPoints,
+    foot_slips,
+    lasting,
+    mean_near,
+    stance,
+)
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import (
     axis_angle_to_quat,
-    forward_kinematics,
     quat_between,
     quat_distance,
     quat_mul,
 )
-from poise.motion.smoothing import find_runs, gaussian, smooth_lift
+from poise.motion.smoothing import gaussian, smooth_lift
 
-#: A (s) and B (1/s) of the module's text.
+#: A (s) and B (1/s) of `lead`.
 SMOOTH_S, RETURN_PER_S = 0.006, 0.6
 #: See `limbs.soft_reach`: feet that stand are kept in place by legs that may be nearly straight.
 SOFT = 0.003
@@ -54,7 +63,16 @@ def lead(
     vertical: float = 0.0,
     flat: np.ndarray | None = None,
 ) -> Lead:
-    """How a foot must be led; see the module's text.
+    """How a foot must be led so that its sole does not travel where it bears: a small smooth correction.
+
+    Both ends p of a sole are moved by a shift s of the foot and a turn psi about the vertical:
+
+        min  sum over frames dt [ sum over ends p  w_p |v_p + s' + psi' z x r_p|^2
+                                  + A^2 (|s''|^2 + L^2 psi''^2) + B^2 (|s|^2 + L^2 psi^2) ]
+
+    v_p is the horizontal velocity of an end, w_p how much it bears, r_p its place from the ankle and L
+    the length of the sole. B leaves slow drifts of long stances where they are, A lets a swinging foot
+    go back to its own path without a jerk.
 
     Args:
         weight: `(T - 1, 2)`, how much each end bears between frames.
@@ -104,9 +122,7 @@ def lead(
 
 def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]) -> Tensor:
     """The motion `(T, J, 4)` with the feet (by joint) led, their legs bent to follow, all else kept."""
-    pos, quat = forward_kinematics(
-        skeleton.parents, torch.tensor(skeleton.offsets, dtype=rot.dtype), root, rot
-    )
+    pos, quat = skeleton.forward(root, rot)
     goals: dict[int | str, Tensor] = {j: pos[:, j] + one.shift for j, one in leads.items()}
     touched = torch.zeros(len(rot), dtype=torch.bool)
     for one in leads.values():
@@ -213,11 +229,10 @@ def hold(
         fixed: `(T)` bool, frames that stay as they are.
         vertical: the heights of the soles' ends are held as well, with this share of their weight.
     """
-    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
     pinned = None if fixed is None else fixed.numpy()
     for _ in range(rounds):
         leads = {}
-        for foot, one in standing(*forward_kinematics(skeleton.parents, offsets, root, rot)).items():
+        for foot, one in standing(*skeleton.forward(root, rot)).items():
             flat = None if one.flat is None else one.flat.numpy()
             leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical, flat)
             if one.lift is not None:
@@ -294,56 +309,8 @@ def _too_fast(
     return out
 
 
-#: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
-#: (m/s) that a rolling sole has anyway and that is left.
-COMMON_S, ROLL_SPEED = 0.4, 0.04
 #: What is faster (m/s) swings through, or skates, and is not held.
 SWING_SPEED = 1.0
-#: The path drifts only where soles lie flat for so long (s) and slip with no more than this share of
-#: unsteadiness, each foot for this time (s) in all, and one foot tells this share of the other's slips.
-FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
-
-
-def drifts(support: FloorPoints) -> bool:
-    """Whether the path itself drifts: what slips is one motion of the floor, the same for both feet.
-
-    A foot tells where its whole sole is down for `FLAT_S` and slips steadily; one that rolls, pivots or
-    trembles does not. From the slips of either foot those of the other must follow, so that at least
-    `EXPLAINED` of their energy goes.
-    """
-    contact = support.contacts[1].numpy()
-    velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
-    told = []
-    for foot in dict.fromkeys(support.feet):
-        mine = np.flatnonzero(np.array(support.feet) == foot)
-        slip, weight = velocity[:, mine].mean(1), np.zeros(len(velocity))
-        turning = np.linalg.norm(velocity[:, mine] - slip[:, None], axis=-1).max(1)
-        for first, last in find_runs(np.all(contact[:, mine], axis=-1), 0):
-            run = slice(first, last + 1)
-            mean = slip[run].mean(0)
-            off = np.linalg.norm(slip[run] - mean, axis=-1) + turning[run]
-            size = float(np.linalg.norm(mean))
-            if last - first + 1 >= FLAT_S * support.fps and np.sqrt(np.mean(off**2)) <= STEADY * size:
-                weight[run] = 1.0
-        told.append((slip, weight))
-    if len(told) != 2 or min(weight.sum() for _, weight in told) < TOLD_S * support.fps:
-        return False
-    for (slip, weight), (other, here) in (told, told[::-1]):
-        guess, near = _mean_near(other, here, support.fps)
-        both = (weight > 0) & (near > 0)
-        energy = float((slip[both] ** 2).sum())
-        left = float(((slip[both] - guess[both]) ** 2).sum())
-        if energy < ROLL_SPEED**2 * both.sum() or left > (1 - EXPLAINED) * energy or not both.any():
-            return False
-    return True
-
-
-def _mean_near(slip: np.ndarray, weight: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """The mean `(T, 2)` of `slip (T, 2)` by `weight (T)` around every frame, and the weight there."""
-    kernel = gaussian(COMMON_S * fps)
-    parts = [np.pad(x, len(kernel) // 2) for x in (weight, slip[:, 0] * weight, slip[:, 1] * weight)]
-    total, *mean = (np.convolve(x, kernel, "valid") for x in parts)
-    return np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None], total
 
 
 def mend_path(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
@@ -358,7 +325,7 @@ def mend_path(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
     slip = np.sum([slip for _, slip, _ in feet], axis=0) / np.maximum(weight, 1.0)[:, None]
     if not weight.any() or not faults:
         return clip
-    mean = _mean_near(slip, weight, clip.fps)[0]
+    mean = mean_near(slip, weight, clip.fps)[0]
     size = np.linalg.norm(mean, axis=-1, keepdims=True)
     mean = mean * np.maximum(1.0 - ROLL_SPEED / np.maximum(size, 1e-9), 0.0)
     near = np.zeros(clip.frames - 1)
@@ -405,26 +372,23 @@ def mend_slides(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
     return clip.replaced(rot=out.numpy())
 
 
-#: What an end of a sole does that stands (deviations): m/s level, by axis, and of its rise; m of height.
-LEVEL_SPEED, RISE_SPEED, HEIGHT_M = 0.05, 0.06, 0.012
-#: The same of one that swings, at least; and so many times that of one that stands.
-SWING = (1.0, 0.5, 0.12)
-WIDER = 3.0
-#: How long (s) noise lasts, so that frames in it tell one thing, and a foot stands or swings.
-ALIKE_S, LASTS_S = 0.1, 0.4
-#: How often both are told, and how surely an end stands that bears: the power of its probability.
-TOLD_ROUNDS, SURE = 4, 3
+#: How surely an end stands that bears: the power of its probability.
+SURE = 3
 #: How long (s) an end stands at least that rolls as slowly as above.
 ROLLS_S = 0.3
-#: See the module's text: how much an end bears, at most, and how that grows.
+#: See `steadied`: how much an end bears, at most, and how that grows.
 BEARS, MOST, STEEP = 0.0012, 1.0, 1.5
 
 
 def steadied(clip: Clip, support: FloorPoints) -> Clip:
-    """The clip with its feet held while they stand; see the module's text."""
+    """The clip with its feet held while they stand: as firmly as noise is left in them, no more.
+
+    Feet roll and pivot where they stand. Beyond what they do, q, the speed s is noise: an end bears by
+    (s^2 / q^2 - 1) to the power of `STEEP`.
+    """
     stands, level, rise = stance(support)
     firm, upright = (float(_firm(s / q)) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
-    rolls = np.maximum(ROLLS_S * support.fps / _lasting(stands), 1.0)
+    rolls = np.maximum(ROLLS_S * support.fps / lasting(stands), 1.0)
     weight = torch.tensor(_firm(level / (LEVEL_SPEED * rolls)) * stands**SURE)
     if firm <= 0.0 or not bool(weight.any()):
         return clip
@@ -442,63 +406,6 @@ def steadied(clip: Clip, support: FloorPoints) -> Clip:
     return clip.replaced(rot=out.numpy())
 
 
-def stance(support: FloorPoints) -> tuple[np.ndarray, float, float]:
-    """How likely each end of a sole stands between frames `(T - 1, F)`, and the deviations of its level
-    speed (by axis) and of its rise while it does, m/s. Contacts that a file states stay."""
-    soles, fps = support.soles.numpy(), support.fps
-    velocity = np.diff(soles, axis=0) * fps
-    height = np.maximum(soles[1:, :, 2], soles[:-1, :, 2]) + support.fit.lift_m
-    stands, level, rise = support.contacts[1].numpy().astype(float), 0.0, 0.0
-    if support.labels is None:
-        # Where all that is near the floor is fast, a foot swings through; skating is no tremble.
-        stands *= support.contacts[0].numpy() <= SWING[0]
-    for _ in range(TOLD_ROUNDS):
-        total = stands.sum()
-        if total < 1.0:
-            break
-        floor = (stands * height).sum() / total
-        # Lower than the floor is on it.
-        parts = (velocity[..., :2], velocity[..., 2:], np.maximum(height - floor, 0.0)[..., None])
-        ratio, sizes = np.zeros_like(height), list[float]()
-        for y, own, least in zip(parts, (LEVEL_SPEED, RISE_SPEED, HEIGHT_M), SWING, strict=True):
-            square, count = (y**2).sum(-1), y.shape[-1]
-            spread = square if y is not parts[2] else (height - floor) ** 2
-            size = float(np.sqrt((stands * spread).sum() / (count * total) + own**2))
-            wide = max(least, WIDER * size)
-            ratio += count * np.log(wide / size) - 0.5 * square * (size**-2 - wide**-2)
-            sizes.append(size)
-        level, rise = sizes[:2]
-        if support.labels is not None:
-            break
-        stands = _joined(ratio / max(ALIKE_S * fps, 1.0), min(0.5, 1.0 / (LASTS_S * fps)))
-    return stands, level, rise
-
-
 def _firm(share: float | np.ndarray) -> np.ndarray:
     """How much an end bears that is so many times as fast as those without noise are."""
     return np.minimum(MOST, BEARS * np.maximum(np.square(share) - 1.0, 0.0) ** STEEP)
-
-
-def _lasting(stands: np.ndarray) -> np.ndarray:
-    """`(T, F)` frames, how long each end stands around every frame by `stands (T, F)`; 1 elsewhere."""
-    out = np.ones_like(stands)
-    for k in range(stands.shape[1]):
-        for a, b in find_runs(stands[:, k] > 0.5, 0):
-            out[a : b + 1, k] = b - a + 1
-    return out
-
-
-def _joined(ratio: np.ndarray, change: float) -> np.ndarray:
-    """Probabilities `(T, F)` of the first of two states from their log ratios `(T, F)`, by the forward
-    and the backward pass of a chain that changes state with the probability `change` at every step."""
-
-    def passed(x: np.ndarray) -> np.ndarray:
-        out, before = np.empty_like(x), np.zeros(x.shape[1])
-        for t in range(len(x)):
-            share = change + (1.0 - 2.0 * change) / (1.0 + np.exp(-np.clip(before, -40.0, 40.0)))
-            out[t] = np.log(share / (1.0 - share))
-            before = out[t] + x[t]
-        return out
-
-    both = passed(ratio) + passed(ratio[::-1])[::-1] + ratio
-    return 1.0 / (1.0 + np.exp(-np.clip(both, -40.0, 40.0)))

@@ -16,7 +16,6 @@ from poise.motion import Skeleton
 from poise.motion.rotations import (
     across,
     axis_angle_to_quat,
-    forward_kinematics,
     normalize,
     quat_between,
     quat_mul,
@@ -24,7 +23,7 @@ from poise.motion.rotations import (
     quat_rotate_inv,
     shortest_arc,
 )
-from poise.motion.smoothing import find_runs
+from poise.motion.smoothing import find_runs, smoothstep
 
 #: The share of a limb's length over which it slows down before it is straight.
 SOFT = 0.02
@@ -109,10 +108,9 @@ def match_positions(
         soft: see `soft_reach`; a limb that the motion itself holds straighter may stay so.
     """
     out = rot.clone()
-    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
     for joint, goal in targets.items():
         limb = (limbs or {}).get(joint) or limb_of(skeleton, joint)
-        pos, quat = forward_kinematics(skeleton.parents, offsets, root_pos, out)
+        pos, quat = skeleton.forward(root_pos, out)
         goal = torch.as_tensor(goal, dtype=rot.dtype)
         now = pos[:, limb.end]
         goal = torch.where(goal.isfinite().all(-1, keepdim=True), goal, now)
@@ -193,7 +191,7 @@ def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor
     size = own.norm(dim=-1, keepdim=True)
     # Full weight on the moment's own axis from 2 * STRAIGHT on.
     share = ((size - STRAIGHT) / STRAIGHT).clamp(0.0, 1.0)
-    share = share * share * (3 - 2 * share)
+    share = smoothstep(share)
     mixed = share * signed / size.clamp_min(1e-12) + (1 - share) * usual
     axis = normalize(torch.where(mixed.norm(dim=-1, keepdim=True) < 0.1, usual, mixed))
     return quat_rotate(upper_quat, axis), (own * axis).sum(-1)
@@ -232,9 +230,3 @@ def _turn(
     rot[:, limb.root] = quat_between(above(limb.root), quat_mul(swing, quat[:, limb.root]))
     rot[:, limb.mid] = quat_between(above(limb.mid), quat_mul(bend, quat[:, limb.mid]))
     rot[:, limb.end] = quat_between(quat_mul(both, above(limb.end)), quat[:, limb.end])
-
-
-def _direction(v: Tensor) -> Tensor:
-    """`v (..., 3)` at unit length; a zero vector points down."""
-    down = torch.tensor([0.0, 0.0, -1.0], dtype=v.dtype)
-    return torch.where(v.norm(dim=-1, keepdim=True) < 1e-12, down, normalize(v))

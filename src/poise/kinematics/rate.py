@@ -18,7 +18,7 @@ from poise.formats import read_clip as read_as_stated
 from poise.formats.guess import root_jumps
 from poise.kinematics.feet import NEAR_M, soles_of
 from poise.kinematics.forward import centre_of_mass, extreme_points, poses_of
-from poise.metrics.shapes import PIECE
+from poise.metrics.shape_points import PIECE
 from poise.motion import Clip
 from poise.motion.rotations import GRAVITY
 from poise.motion.smoothing import find_runs, gaussian

@@ -18,7 +18,6 @@ from poise.kinematics.limbs import limb_of, match_positions
 from poise.motion import Skeleton
 from poise.motion.rotations import (
     axis_angle_to_quat,
-    forward_kinematics,
     normalize,
     quat_between,
     quat_mul,
@@ -26,7 +25,7 @@ from poise.motion.rotations import (
     shortest_arc,
     slerp,
 )
-from poise.motion.smoothing import find_runs, smooth_lift
+from poise.motion.smoothing import find_runs, smooth_lift, smoothstep
 
 #: Below this distance (m) of ankle or toes, whichever is less, a foot shuffles, turns or rolls.
 LEAST_M = 0.05
@@ -237,8 +236,7 @@ def planted(
     if not ankles or not all(hips) or off_floor[0] == off_floor[1]:
         return motion
     (root, rot), back = motion, off_floor[0]
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
-    pos = forward_kinematics(skeleton.parents, offsets, root, rot)[0]
+    pos = skeleton.forward(root, rot)[0]
     stands = -1 if back else 0
     left = (pos[stands, hips[0][0]] - pos[stands, hips[1][0]]) * root.new_tensor((1.0, 1.0, 0.0))
     left = left / left.norm().clamp_min(1e-9)
@@ -247,7 +245,7 @@ def planted(
     root[1:-1] -= TRUNK_M * lean.sin()[:, None] * facing
     leans = axis_angle_to_quat(left.expand(len(lean), 3), lean)
     turned[1:-1, 0] = quat_mul(leans, rot[1:-1, 0])
-    pos, quat = forward_kinematics(skeleton.parents, offsets, root, turned)
+    pos, quat = skeleton.forward(root, turned)
     toes = {skeleton.parents[toe]: toe for _, toe in anatomy.toes}
     goals: dict[int | str, Tensor] = {}
     for joint in ankles:
@@ -294,12 +292,12 @@ def _leaves(
     axis = torch.stack((-flat[1], flat[0], 0.0 * flat[0])).expand(frames, 3)
     length = max(float(sole.norm()), HEEL_M)
     tilted = quat_mul(axis_angle_to_quat(axis, (up / length).asin()), quat[:1])
-    return place, slerp(tilted, quat[-1:].expand_as(tilted), smooth(u[:, 0]))
+    return place, slerp(tilted, quat[-1:].expand_as(tilted), smoothstep(u[:, 0]))
 
 
 def hermite(u: Tensor, start: Tensor, stop: Tensor, leave: Tensor, reach: Tensor) -> Tensor:
     """The cubic from `start` to `stop` at `u` from 0 to 1, with its derivatives at both ends."""
-    rise = u * u * (3.0 - 2.0 * u)
+    rise = smoothstep(u)
     return start + rise * (stop - start) + u * (1.0 - u) ** 2 * leave - u * u * (1.0 - u) * reach
 
 
@@ -367,7 +365,7 @@ def path_of(
     if up[1]:
         places[-1], turns[-1] = ends.toe[1, k], ends.quat[1, k]
     if n == 0:
-        u = smooth(t / max(seconds, 1e-9))[:, None]
+        u = smoothstep(t / max(seconds, 1e-9))[:, None]
         tip = torch.lerp(ends.level_toe[0, k], ends.level_toe[1, k], u)
         turn = slerp(
             ends.level_quat[0, k].expand(len(t), 4), ends.level_quat[1, k].expand(len(t), 4), u[:, 0]
@@ -391,10 +389,10 @@ def path_of(
         clear = CLEAR_M * torch.sin(torch.pi * u).square()
         swung = swung + torch.stack((0.0 * clear, 0.0 * clear, clear), -1)
         at_start = turn[int((t <= swing.start + 1e-9).nonzero()[-1])]
-        turned = slerp(at_start.expand(len(t), 4), turns[i + 1].expand(len(t), 4), smooth(u))
+        turned = slerp(at_start.expand(len(t), 4), turns[i + 1].expand(len(t), 4), smoothstep(u))
         later = (t > swing.start)[:, None]
         tip, turn = torch.where(later, swung, tip), torch.where(later, turned, turn)
-        even = slerp(turns[i].expand(len(t), 4), turns[i + 1].expand(len(t), 4), smooth(u))
+        even = slerp(turns[i].expand(len(t), 4), turns[i + 1].expand(len(t), 4), smoothstep(u))
         flat = torch.where(later, even, flat)
     tip, flat = _from_and_to(t, k, swings, up, ends, tip, flat)
     turn = _from_and_to(t, k, swings, up, ends, tip, turn)[1]
@@ -413,7 +411,7 @@ def _from_and_to(
         room = seconds / 2
         if swings:
             room = swings[0].start if end == 0 else seconds - swings[-1].stop
-        left = 1.0 - smooth((since / max(min(ROLL_S, room), LEAST_ROLL_S)).clamp(0.0, 1.0))
+        left = 1.0 - smoothstep((since / max(min(ROLL_S, room), LEAST_ROLL_S)).clamp(0.0, 1.0))
         tip = tip + left[:, None] * (ends.toe[end, k] - ends.level_toe[end, k])
         turn = slerp(turn, ends.quat[end, k].expand_as(turn), left)
     return tip, turn
@@ -424,11 +422,6 @@ def _left(turn: Tensor, sole: Tensor) -> Tensor:
     way = quat_rotate(turn, sole.expand(len(turn), 3))
     up = torch.tensor([0.0, 0.0, 1.0], dtype=way.dtype).expand_as(way)
     return normalize(torch.linalg.cross(up, way))
-
-
-def smooth(u: Tensor) -> Tensor:
-    """From 0 to 1, level at both ends."""
-    return u * u * (3.0 - 2.0 * u)
 
 
 #: The share of its length that a leg is stretched to, and m that hips come down for it at most.
@@ -465,14 +458,14 @@ def stepped(
         return None
     root, rot = motion[0].clone(), motion[1].clone()
     offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
-    pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+    pos, quat = skeleton.forward(root, rot)
     soles = offsets[[toes[a] for a in ankles]]
     ends = ends_of(pos[[0, -1]], quat[[0, -1]], ankles, [toes[a] for a in ankles], soles, floor)
     seconds = (len(root) - 1) / fps
     ways = [float(w[:2].norm()) for w in ends.level_toe[1] - ends.level_toe[0]]
     past_toes = None
     if past is not None:
-        was = forward_kinematics(skeleton.parents, offsets, *past)[0][0]
+        was = skeleton.forward(*past)[0][0]
         past_toes = [(pos[0, toes[a]] - was[toes[a]]) * fps for a in ankles]
     t = torch.arange(len(root), dtype=rot.dtype) / fps
     tried: set[tuple[Swing, ...]] = set()
@@ -559,7 +552,7 @@ def _lowered(
     t = torch.arange(len(root), dtype=root.dtype) / fps
     near = (torch.minimum(t, t[-1] - t) / ROLL_S).clamp(0.0, 1.0)
     out = root.clone()
-    out[:, 2] -= down * smooth(near)
+    out[:, 2] -= down * smoothstep(near)
     return out
 
 
@@ -589,8 +582,7 @@ def lock_feet(
 
     def ends(rot: Tensor) -> Tensor:
         """`(T, K, 2, 3)` m, ankles and toes in the gap."""
-        offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
-        pos = forward_kinematics(skeleton.parents, offsets, root[gap], rot[gap])[0]
+        pos = skeleton.forward(root[gap], rot[gap])[0]
         return pos[:, [[s.ankle, s.toe] for s in soles]]
 
     def stands() -> Tensor:

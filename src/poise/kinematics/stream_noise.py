@@ -288,7 +288,20 @@ class _Past(NamedTuple):
 
 
 class FadingFilter:
-    """Smooths channels `(C)` sample by sample.
+    """Smooths channels `(C)` sample by sample, from their past alone.
+
+        fading = FadingFilter(groups, weights)
+        x = fading(z, dt)            # the newest sample as it is now known
+        earlier = fading.before()    # the samples before it, by all that has come since
+
+    A channel is z = x + n + e: motion x, a tremble n of one frequency, white noise e of variance R. x
+    moves on by its velocity, driven by white noise of power R dt (2 pi c)^4. Kalman filters of several c
+    (Hz) run side by side; a group takes their mean, each weighted by how likely it made the group's last
+    samples (Magill 1965, with a memory that fades):
+
+        log w <- e^(-dt / tau) log w - |z - H x'|^2 / (2 R S) - d / 2 log S.
+
+    The samples before the newest are those of a Rauch-Tung-Striebel smoother.
 
     Args:
         groups, weights, places: as of `StreamNoise`.

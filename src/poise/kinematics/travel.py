@@ -1,4 +1,12 @@
-"""Motion in place: the travel that was taken out of a clip, told by the limbs that bear it."""
+"""Motion in place: the travel that was taken out of a clip, told by the limbs that bear it.
+
+A foot that bears stands still in the world. In a clip in place it goes backwards instead, with all other
+feet that bear, and the root stays where it is. The motion in the world is
+
+    x_world = G(t) x,    G' = G xi,    xi p = v + w z x p = -p'    for every point p that bears,
+
+so that the twist xi = (v, w) is fitted to the velocities p' of points that bear.
+"""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from poise.learn.networks import MLP, RunningNorm
 from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_statistics, sums
 from poise.learn.protocols import DemoSampler, FeatureSource
 from poise.learn.rollout import TrainingError, check_finite
-from poise.learn.windows import History, WindowBuffer
+from poise.learn.window_sampler import History, WindowBuffer
 from poise.settings import Checked, Count, Limit, Positive, Share
 
 

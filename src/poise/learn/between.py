@@ -23,7 +23,7 @@ from poise.learn.transition import (
     out_of_place,
     place_of,
 )
-from poise.learn.windows import Sampler, Windows
+from poise.learn.window_sampler import Sampler, Windows
 from poise.motion.rotations import (
     matrix_kinematics,
     matrix_to_quat,
@@ -450,7 +450,7 @@ class BetweenTraining:
 
 
 class BetweenObjective:
-    """Loss and update of a `Between` network; see `learn.inbetween.InbetweenTrainer`."""
+    """Loss and update of a `Between` network; see `learn.inbetween_model.InbetweenTrainer`."""
 
     def __init__(self, net: Between, config: BetweenTraining, std: Tensor, steps: int):
         self.net, self.config, self.std, self.steps = net, config, std, steps

@@ -404,7 +404,7 @@ class PackedFrames:
 
 
 class CVAEObjective:
-    """Loss and update of a kinematic policy; see `learn.inbetween.InbetweenTrainer`.
+    """Loss and update of a kinematic policy; see `learn.inbetween_model.InbetweenTrainer`.
 
     Args:
         steps: of the whole training.

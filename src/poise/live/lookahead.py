@@ -47,7 +47,7 @@ def tries_of(tracker: Tracker, config: LookaheadConfig, seed: int) -> Lookahead:
     out = look_ahead(tracker, task, config, 1, seed)
     goal = StreamGoal(task.humanoid, task.config.sim.control_hz, out.copies.num_envs)
     goal.push(tracker.recovery_clips.ease)
-    goal.draw(torch.arange(out.copies.num_envs))
+    goal.reset(torch.arange(out.copies.num_envs))
     out.copies.set_goal(goal)
     return out
 

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
@@ -289,24 +288,3 @@ def as_json(time_s: float, doing: Sequence[str], bodies: np.ndarray) -> str:
 
 #: What characters do, in the order of the numbers in frames.
 DOING = ("at ease", "tracks", "falls", "gets up")
-
-
-def hello_of(table: BodyTable, count: int, rate_hz: float, more: Mapping[str, Any]) -> dict[str, Any]:
-    """What a page needs to draw the characters.
-
-    more: of it, such as whether there is a recorder.
-    """
-    return {
-        "characters": count,
-        "rate": rate_hz,
-        "bodies": [r.name for r in table.rows],
-        "parents": [r.parent for r in table.rows],
-        "shapes": [
-            {"body": i, "kind": g.kind, "size": list(g.size), "pos": list(g.pos), "quat": list(g.quat)}
-            for i, row in enumerate(table.rows)
-            for g in row.geoms
-        ],
-        "ball": 0.12,
-        "doing": list(DOING),
-        **more,
-    }

@@ -20,15 +20,17 @@ from typing import Any
 
 import numpy as np
 
+from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
 from poise.live.page.server import PageServer
-from poise.live.people import STAND
-from poise.live.protocol import DOING, LiveConfig, as_json, hello_of, packed
+from poise.live.people import STAND, Steady
+from poise.live.points import PointFit
+from poise.live.protocol import DOING, LiveConfig, as_json, packed
 from poise.live.sinks import CharacterRecorder, OwnPuppet, VmcSink
 from poise.live.sockets import Guard, StreamDoor
-from poise.live.sources import FileSource, PointFit
+from poise.live.sources import FileSource
 from poise.live.stream import Inbox, StreamTremble
 from poise.live.targets import Targets
 from poise.live.vmc import VmcSource
@@ -223,6 +225,27 @@ def _percentiles(seconds: deque[float]) -> list[float]:
     return [round(float(np.percentile(kept, p)), 1) for p in (50, 99)]
 
 
+def hello_of(table: BodyTable, count: int, rate_hz: float, more: Mapping[str, Any]) -> dict[str, Any]:
+    """What a page needs to draw the characters.
+
+    more: of it, such as whether there is a recorder.
+    """
+    return {
+        "characters": count,
+        "rate": rate_hz,
+        "bodies": [r.name for r in table.rows],
+        "parents": [r.parent for r in table.rows],
+        "shapes": [
+            {"body": i, "kind": g.kind, "size": list(g.size), "pos": list(g.pos), "quat": list(g.quat)}
+            for i, row in enumerate(table.rows)
+            for g in row.geoms
+        ],
+        "ball": 0.12,
+        "doing": list(DOING),
+        **more,
+    }
+
+
 #: What a step goes to; it returns at once.
 Shows = Callable[[LiveStep], None]
 #: s for which no character looks ahead after a step that came too late.
@@ -255,7 +278,7 @@ class Live:
         generator: Kinematic | None = None,
     ):
         self.config = c = config or LiveConfig()
-        self.tracker, self.inbox = tracker, inbox or Inbox(steady=True)
+        self.tracker, self.inbox = tracker, inbox or Inbox(Steady)
         ahead, beside = tuple(range(c.lookahead)), executor is not None
         self.world = LiveWorld(tracker, c.characters, executor, ahead, c.seed, beside)
         self.aims = Targets(self.world, c, executor, generator)
@@ -364,7 +387,7 @@ class Session:
 
     def __init__(self, tracker: Tracker, config: LiveConfig, wanted: SessionConfig):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="poise-live")
-        self.inbox, clock = Inbox(steady=True), time.perf_counter
+        self.inbox, clock = Inbox(Steady), time.perf_counter
         made = generator_for(tracker)
         self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock, generator=made)
         world = self.live.world

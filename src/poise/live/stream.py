@@ -6,15 +6,13 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.kinematics.retarget.passage import doublings, world_of
-from poise.kinematics.stream_noise import FadingFilter
 from poise.motion import Clip, Skeleton
 from poise.motion import quats as q
 
@@ -100,103 +98,33 @@ def checked(packet: Packet) -> Packet:
     return replace(packet, rot=q.normalized(packet.rot))
 
 
-#: s by which a clock goes back that began anew.
-ANEW_S = 2.0
+class Smooths(Protocol):
+    """What smooths the poses of one person, in the order in which they come."""
 
-
-class Steady:
-    """The poses of one person, in the order in which they come. One that does not tremble is given back
-    as it came."""
-
-    def __init__(self, skeleton: Skeleton):
-        self.skeleton = skeleton
-        self._fading: FadingFilter | None = None
-        self._last = np.zeros((len(skeleton), 4))
-        self._root = np.zeros(3)
-        self._times = deque[float](maxlen=16)
-        self._busy = threading.Lock()
+    skeleton: Skeleton
 
     @property
     def tremble(self) -> StreamTremble:
         """What the person does now."""
-        fading = self._fading
-        return (
-            StreamTremble()
-            if fading is None
-            else StreamTremble(fading.noise.mm, fading.noise.hz, fading.late_s)
-        )
+        ...
 
     def __call__(
         self, time_s: float, root: np.ndarray, rot: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The pose of `time_s` as it is known, None where a newer one came before it."""
-        with self._busy:
-            times = self._times
-            dt = time_s - times[0] if times else 0.0
-            if -ANEW_S <= dt <= 0.0 and times:
-                return None
-            if self._fading is None:
-                self._fading = self._begun(rot)
-            z = self._channels(root, rot)
-            leaps = bool(times) and leapt(self._root, root, dt)
-            if leaps or dt < 0.0:
-                times.clear()
-            times.appendleft(time_s)
-            self._root = root
-            if leaps:
-                self._fading.restart(z)
-                return root, rot
-            x = self._fading(z, dt)
-            return (root, rot) if x is z else (x[-3:], self._rotations(x))
+        """The pose as it is known, None where a newer one came before it."""
+        ...
 
     def before(self) -> list[Earlier]:
-        """The poses before it, from the latest on, by all that came since; none if nothing trembles."""
-        if self._fading is None:
-            return []
-        known = zip(list(self._times)[1:], self._fading.before(), strict=False)
-        return [Earlier(t, x[-3:], self._rotations(x)) for t, x in known]
-
-    def _channels(self, root: np.ndarray, rot: np.ndarray) -> np.ndarray:
-        """`(C)`: rotations, each of the sign of the one before, and the root."""
-        flip = (rot * self._last).sum(-1, keepdims=True) < 0
-        self._last = np.where(flip, -rot, rot)
-        return np.concatenate((self._last.ravel(), root))
-
-    def _rotations(self, x: np.ndarray) -> np.ndarray:
-        return q.normalized(x[:-3].reshape(-1, 4))
-
-    def _begun(self, rot: np.ndarray) -> FadingFilter:
-        count = len(self.skeleton)
-        groups = np.append(np.repeat(np.arange(count), 4), [count] * 3)
-        at = self._places(np.append(rot.ravel(), np.zeros(3))[None])[0]
-        far = np.zeros((count, count))
-        for j in range(count):
-            above = j
-            while above >= 0:
-                far[above, j] = np.linalg.norm(at[j] - at[above])
-                above = self.skeleton.parents[above]
-        # A turn that errs by a variance v, the sum over its components, moves what is d m away by
-        # sqrt(8 v / 3) d.
-        weights = np.append(np.sqrt(8.0 / 3.0 * (far**2).mean(1)), 1.0)
-        return FadingFilter(groups, weights, self._places)
-
-    def _places(self, channels: np.ndarray) -> np.ndarray:
-        """`(T, J, 3)` m of channels `(T, C)`."""
-        skeleton = self.skeleton
-        world = world_of(skeleton, channels[:, :-3].reshape(len(channels), -1, 4))
-        above = np.maximum(skeleton.parents, 0)
-        out = q.rotate(world[:, above], np.asarray(skeleton.offsets))
-        out[:, 0] = channels[:, -3:]
-        for joints, parents in doublings(tuple(skeleton.parents)):
-            out[:, joints] = out[:, parents] + out[:, joints]
-        return out
+        """Those before it, from the latest on."""
+        ...
 
 
 class Inbox:
     """Packets on their way from the sources' threads to the loop; neither waits for the other.
 
     Args:
-        steady: smooths poses that tremble, on the way in and in the source's thread.
+        steady: makes what smooths the poses of a skeleton, on the way in and in the source's thread;
+            None lets them be.
 
     Attributes:
         received: packets that were taken.
@@ -205,14 +133,14 @@ class Inbox:
         standing: people of keypoints that are measured yet, and how far that is, 0 to 1.
     """
 
-    def __init__(self, steady: bool = False) -> None:
+    def __init__(self, steady: Callable[[Skeleton], Smooths] | None = None) -> None:
         self.received, self.crowded = 0, 0
         self.refused: Counter[str] = Counter()
         self.standing = dict[str, float]()
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[tuple[float, Packet]]] = {}
-        self._smooths = steady
-        self._steady: dict[str, Steady] = {}
+        self._make = steady
+        self._steady: dict[str, Smooths] = {}
 
     def refuse(self, reason: str) -> None:
         """Counts something that is no packet."""
@@ -240,12 +168,12 @@ class Inbox:
 
     def _smoothed(self, packet: Packet) -> Packet:
         """The packet as its person is now known; one that comes late is left as it is."""
-        if packet.tremble is not None or not self._smooths:
+        if packet.tremble is not None or self._make is None:
             return packet
         with self._lock:
             steady = self._steady.pop(packet.person, None)
             if steady is None or steady.skeleton is not packet.skeleton:
-                steady = Steady(packet.skeleton)
+                steady = self._make(packet.skeleton)
             # Those that were heard of last are the last.
             self._steady[packet.person] = steady
             while len(self._steady) > PEOPLE:

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from poise.control import Compliance
+from poise.env.events import Felt, Force
 from poise.env.goal import Goal
-from poise.env.plugins import Felt, Plugin
 from poise.env.recovery.clips import GetUpPlanner
 from poise.env.stream import StreamGoal
 from poise.env.yielding import Yielding
@@ -37,7 +37,7 @@ PULL, DAMP, MOST_N = 400.0, 40.0, 500.0
 BLOW_NS, BLOW_S = 150.0, 0.1
 
 
-class PushInput(Plugin):
+class PushInput(Force):
     """One hand and one blow on each of K characters; their forces are held for a control step."""
 
     def __init__(self, goal: Goal, backend: Backend):
@@ -63,7 +63,7 @@ class PushInput(Plugin):
         force = torch.tensor(direction / max(float(np.linalg.norm(direction)), 1e-9)) * BLOW_NS / BLOW_S
         self._blows[character] = force, max(1, round(BLOW_S * self._rate_hz))
 
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """Adds what pulls and strikes."""
         self._force.zero_()
         state = self._backend.state
@@ -81,6 +81,7 @@ class PushInput(Plugin):
                 self._blows[k] = force, left - 1
             else:
                 del self._blows[k]
+        return False
 
     def felt(self) -> Felt:
         """The forces of this control step."""
@@ -171,7 +172,7 @@ class LiveWorld:
         task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
         # The dials begin at 0, where nothing gives way.
         yields = Compliance(level=0.0)
-        own = replace(task.task, help_by="all", compliance=yields, plugins=(PushInput,))
+        own = replace(task.task, help_by="all", compliance=yields, events=(PushInput,))
         task = replace(task, task=own)
         body, sim = task.humanoid, task.config.sim
         self.humanoid, self.rate_hz = body, sim.control_hz
@@ -182,7 +183,7 @@ class LiveWorld:
         # Snapshots are of a character alone, so that lookahead can try with it.
         self.rows = CharacterRows(self.scene.backend, places, alone(body, sim), self.scene)
         self.env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=self.rows)
-        hands, yielding = self.env.plugin(PushInput), self.env.plugin(Yielding)
+        hands, yielding = self.env.event(PushInput), self.env.event(Yielding)
         assert hands is not None and yielding is not None
         self.hands, self.yielding = hands, yielding
         self.goal = StreamGoal(body, self.rate_hz, count, seed=seed)
@@ -229,7 +230,7 @@ class LiveWorld:
             c.begin(frame)
         self.goal.clear(every)
         self.goal.push(frames)
-        self.goal.draw(every)
+        self.goal.reset(every)
         self.env.backend.write(None, frames, qvel)
         self.env.age[:] = 0
         self.env.set_goal(self.goal)

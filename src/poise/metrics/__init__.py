@@ -1,6 +1,6 @@
 """Pure functions that score motion: tracking, plausibility, help; definitions in docs/results.md."""
 
-from poise.metrics.inbetween import l2p, l2q, npss, physics
+from poise.metrics.gap_errors import l2p, l2q, npss, physics
 from poise.metrics.plausibility import (
     Deviation,
     HelpAudit,
@@ -17,8 +17,15 @@ from poise.metrics.plausibility import (
     s2h_foot_penetration,
     smoothness,
 )
-from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
-from poise.metrics.tracking import (
+from poise.metrics.shape_points import (
+    KINDS,
+    Shapes,
+    centre_of_mass,
+    foot_points,
+    geom_heights,
+    lowest_points,
+)
+from poise.metrics.tracking_errors import (
     LASTING_S,
     LOST,
     RULES,

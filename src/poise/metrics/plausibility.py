@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.metrics.tracking import MM, PHC_FPS, masked_mean, masked_quantile, span_mask
+from poise.metrics.tracking_errors import MM, PHC_FPS, masked_mean, masked_quantile, span_mask
 from poise.motion.rotations import GRAVITY
 
 CONTACT_HEIGHT = 0.02

@@ -68,8 +68,7 @@ def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray | float) -> np.ndarray
     """From a to b the short way; shares beyond 1 go on turning."""
     dot = (a * b).sum(-1, keepdims=True)
     b = np.where(dot < 0, -b, b)
-    # |a - b| = 2 sin(half / 2) and |a + b| = 2 cos(half / 2): small angles keep all their digits.
-    half = 2.0 * np.arctan2(*(np.sqrt((x * x).sum(-1, keepdims=True)) for x in (a - b, a + b)))
+    half = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
     share = np.asarray(share, dtype=float)[..., None] if np.ndim(share) else share
     small = half < 1e-6
     sine = np.where(small, 1.0, np.sin(half))

@@ -172,6 +172,11 @@ class Skeleton:
         """Indices of the joints above `joint`, its parent first."""
         return line_to_root(self.parents, joint)[1:]
 
+    def forward(self, root_pos: torch.Tensor, rot: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """World positions `(..., J, 3)` m and rotations `(..., J, 4)`, see `forward_kinematics`."""
+        offsets = torch.tensor(self.offsets, dtype=rot.dtype)
+        return forward_kinematics(self.parents, offsets, root_pos, rot)
+
     def rest_positions(self) -> np.ndarray:
         """`(J, 3)` m, joint positions with every rotation at identity and the root at the origin."""
         return rest_positions(self.parents, self.offsets)

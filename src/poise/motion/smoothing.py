@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -277,7 +278,11 @@ def tremble_of(
 
 
 def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> np.ndarray:
-    """n of the module's text, for white noise of size 1 and a tremble of variance `size`."""
+    """The tremble n, for white noise s of size 1 and a tremble of variance `size`:
+
+    min over x, n   sum |y - x - n|^2 / s^2 + lambda |x'''|^2
+                        + |n_t+1 - 2 r cos(w) n_t + r^2 n_t-1|^2 / q.
+    """
     frames = len(y)
     wander = np.exp(-np.pi * WANDER_HZ / fps)
     step = np.array([wander**2, -2 * wander * np.cos(2 * np.pi * hz / fps), 1.0])
@@ -320,7 +325,13 @@ def spline(frames: int, stiff: float) -> np.ndarray:
 
 
 def smoothed(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """The channels without white noise of variance `floor (G)`, the sum over a group's channels."""
+    """The channels without white noise of variance `floor (G)`, the sum over a group's channels.
+
+    Each is the mean of smoothing splines of many stiffnesses lambda, weighted in every frame by how near
+    to the truth Stein's unbiased estimate says they are, around the frame and over the clip:
+
+        risk = |y - S y|^2 / s^2 + 2 tr(S) / T.
+    """
     from scipy.linalg import cho_solve_banded
     from scipy.ndimage import gaussian_filter1d
 
@@ -347,6 +358,14 @@ def smoothed(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -
         share = gaussian_filter1d(share / share.sum(0), CHANGE_S * fps, axis=1, mode="nearest")
         out[:, mine] = (share[..., None] * stack).sum(0)
     return out
+
+
+Values = TypeVar("Values", np.ndarray, Tensor)
+
+
+def smoothstep(u: Values) -> Values:
+    """From 0 to 1 as `u` does, level at both ends."""
+    return u * u * (3.0 - 2.0 * u)
 
 
 def find_runs(bad: np.ndarray, gap: int) -> list[tuple[int, int]]:

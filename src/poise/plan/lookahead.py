@@ -17,7 +17,7 @@ from poise.kinematics.forward import shapes_of
 from poise.machine import one_thread
 from poise.metrics import has_lost
 from poise.metrics.plausibility import foot_contacts, jerk
-from poise.metrics.shapes import Shapes, foot_points
+from poise.metrics.shape_points import Shapes, foot_points
 from poise.plan.sampling import draw_offsets
 from poise.settings import Count, Length, NotNegative, Range, Share, validate
 

@@ -162,8 +162,11 @@ class Imitation:
         """The learner's settings, with one deviation of the action noise per action, and what smooth
         policies do not answer to."""
         ppo, extra = self.config.ppo, self.task.residual.dims if self.task.residual else 0
-        if ppo.smooth_weight and ppo.smooth_over is None:
-            ppo = replace(ppo, smooth_over=self.task.velocities)
+        if ppo.smooth_weight and ppo.smooth_over is None and self.task.velocities:
+            env = self.env(1, threads=1)
+            first, *_, last = (env.columns[name] for name in (self.task.velocities * 2))
+            env.close()
+            ppo = replace(ppo, smooth_over=(first.start, last.stop))
         if not isinstance(ppo.std, float | int):
             return ppo
         joints = (float(ppo.std),) * len(self.humanoid.hinges)

@@ -25,9 +25,9 @@ from poise.kinematics.forward import shapes_of
 from poise.metrics import foot_points
 from poise.motion import Clip, ClipLibrary
 from poise.motion.noise import VIDEO, perturb_clip, scaled
+from poise.recipes.body_shapes import motions_of, shaped
 from poise.recipes.imitation import Clips, Imitation, fitted
 from poise.recipes.perpetual_settings import Perpetual, Recovers
-from poise.recipes.shapes import motions_of, shaped
 
 
 def noisy(imitation: Imitation, strengths: Sequence[float], seed: int = 0) -> Imitation:
@@ -156,14 +156,16 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
     if config.shape or config.shapes.several:
         own += (ObsTerm("shape", obs.shape, {"sizes": obs.shape_of(humanoid)}),)
     left = None if config.heading == "twist" else torch.tensor(humanoid.left)
-    goal = obs.rotation_goal if config.goal == "rotations" else obs.keypoint_goal
+    goal = ObsTerm("keypoint_goal", obs.keypoint_goal, parts=obs.KEYPOINT_PARTS)
+    if config.goal == "rotations":
+        goal = ObsTerm("rotation_goal", obs.rotation_goal, parts=obs.ROTATION_PARTS)
     limit, gamma = config.help_start, config.ppo.gamma
     recovery = None
     if recovers is not None:
         recovery = Recovery.phc(config.faithful, recovers)
         recovery = replace(recovery, drop=replace(recovery.drop, count=config.recovering.falls))
     return TaskConfig(
-        obs=(*own, ObsTerm(goal.__name__, goal), *_more_seen(config, humanoid)),
+        obs=(*own, goal, *_more_seen(config, humanoid)),
         rewards=_rewards(config, humanoid, recovers is not None),
         dones=(_failure(config, humanoid),),
         pd=_targets(config, humanoid),
@@ -181,9 +183,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         adaptive=config.adaptive_sampling,
         adaptive_over=config.adaptive_over,
         style=obs.style_terms(humanoid) if config.style else (),
-        velocities=obs.velocity_columns(
-            len(humanoid.bodies), shape=len(own) > 1, rotations=config.goal == "rotations"
-        ),
+        velocities=tuple(f"{goal.name}.{part}" for part in goal.parts if part.endswith("vel")),
         recovery=recovery,
     )
 
@@ -215,7 +215,7 @@ def pushed(task: TaskConfig, config: Perpetual, humanoid: Humanoid) -> TaskConfi
         plan.newtons, plan.every_s, plan.lasts_s, rows, config.sim.control_hz, config.seed, plan.share,
         plan.impulse_ns,
     )  # fmt: skip
-    return replace(task, plugins=(*task.plugins, event), compliance=Compliance(drawn=plan.level))
+    return replace(task, events=(*task.events, event), compliance=Compliance(drawn=plan.level))
 
 
 def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[RewardTerm, ...]:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         PPOConfig,
     )
     from poise.plan import TeacherConfig
-    from poise.recipes.shapes import BodyShapes
+    from poise.recipes.body_shapes import BodyShapes
     from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped, so that lying is told from leaning.
@@ -167,7 +167,7 @@ class Perpetual:
 
     goal: Literal["rotations", "keypoints"] = "rotations"
     shape: bool = False
-    shapes: BodyShapes = part("poise.recipes.shapes:BodyShapes")
+    shapes: BodyShapes = part("poise.recipes.body_shapes:BodyShapes")
     heading: Literal["hips", "twist"] = "hips"
     window: Annotated[tuple[int, ...], Range(2, unit="control steps")] = ()
     filter: Annotated[float, Range(0, 1, below=True)] = 0.0

@@ -1,15 +1,6 @@
 """Evaluation: padded rollouts in, a score card with stable keys out."""
 
-from poise.score.card import (
-    THRESHOLDS,
-    CardRow,
-    Help,
-    ScoreCard,
-    Threshold,
-    read_score,
-    table,
-    write_score,
-)
+from poise.score.card import CardRow, Help, ScoreCard, read_score, table, write_score
 from poise.score.episodes import (
     Nothing,
     Observer,
@@ -26,6 +17,7 @@ from poise.score.episodes import (
 from poise.score.recovered import RecoveryCard, recovery_card, trial_task
 from poise.score.rollouts import ClipJudge, ClipResults, RolloutSet
 from poise.score.scorecard import TRACKING, clip_figures, score_rollouts
+from poise.score.thresholds import THRESHOLDS, Threshold
 
 __all__ = [
     "THRESHOLDS",

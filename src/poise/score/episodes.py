@@ -497,13 +497,15 @@ def _transitions(
     episode = torch.arange(len(clip))[:, None].expand_as(kept)[kept]
     hinges = env.goal.humanoid.hinges
     more = tuple(f"residual[{k}]" for k in range(env.num_actions - len(hinges)))
+    spans = [(term.name, env.columns[term.name]) for term in env.task.obs]
+    names = [f"{name}[{k}]" for name, at in spans for k in range(at.stop - at.start)]
     return Transitions(
         **flat,
         episode=episode.numpy(),
         last_obs=last.detach().cpu().float().numpy(),
         clip=clip.numpy().copy(),
         start=start.numpy().copy(),
-        obs_names=tuple(f"{name}[{k}]" for name, size in env.obs_widths.items() for k in range(size)),
+        obs_names=tuple(names),
         action_names=(*hinges, *more),
         term_names=tuple(t.name for t in env.task.rewards),
         clip_names=tuple(env.reference.names),

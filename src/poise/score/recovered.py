@@ -129,7 +129,7 @@ def recovery_card(
         )
     env = make_env(min(trials, at_once))
     try:
-        clock = env.plugin(RecoveryClock)
+        clock = env.event(RecoveryClock)
         if clock is None or env.task.auto_reset:
             raise PoiseError(
                 "the task is none for trials of recovery",

@@ -170,6 +170,11 @@ class CpuBackend(Worlds):
         """Sorted int32 ids for Batch, and the order that sorts the caller's rows likewise."""
         if rows is None:
             return None, None
+        if rows.dtype == torch.int64 and rows.ndim == 1:
+            ids = rows.numpy()
+            # Of sorted ids the first and the last tell the range; resets of few worlds come this way.
+            if len(ids) and ids[0] >= 0 and ids[-1] < self._num_envs and (ids[1:] > ids[:-1]).all():
+                return ids.astype(np.int32), None
         rows = row_index(rows, self._num_envs)
         if bool((rows.diff() > 0).all()):
             return rows.to(torch.int32).numpy(), None

@@ -286,39 +286,6 @@ def _open_edges(vertices: np.ndarray, faces: np.ndarray) -> int:
 
 
 @dataclass(frozen=True)
-class Rod(Checked):
-    """A free rod that stands on its lower end and carries a ball on the upper one; one body, with the
-    lower end as its origin. Nothing touches it, so that what it stands on must be a link.
-
-    Attributes:
-        name: how the scene calls it.
-        length: m, from the lower end to the ball's centre.
-        radius: m, of the ball.
-        mass: kg, of the ball; the rod has a tenth of it.
-        pos: m, its lower end at first.
-    """
-
-    name: str = "rod"
-    length: Positive = 1.0
-    radius: Positive = 0.08
-    mass: Positive = 0.5
-    pos: Vector = (0.0, 0.0, 0.0)
-
-    def add(self, spec: mujoco.MjSpec) -> None:
-        """Adds one body."""
-        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
-        body.add_freejoint(name=self.name)
-        rod, ball = [0.0, 0.0, self.length / 2], [0.0, 0.0, self.length]
-        thin = [0.015, self.length / 2]
-        geoms = (
-            solid(body, f"{self.name}/rod", "capsule", thin, pos=rod, mass=0.1 * self.mass),
-            solid(body, f"{self.name}/ball", "sphere", [self.radius], pos=ball, mass=self.mass),
-        )
-        for geom in geoms:
-            geom.contype = geom.conaffinity = 0
-
-
-@dataclass(frozen=True)
 class Ball(Checked):
     """A free ball.
 
@@ -339,56 +306,3 @@ class Ball(Checked):
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
         body.add_freejoint(name=self.name)
         solid(body, self.name, "sphere", [self.radius], mass=self.mass)
-
-
-@dataclass(frozen=True)
-class Trampoline(Checked):
-    """A plate that a spring and a damper at each corner hold at a height that is its control.
-
-    It has three coordinates, the height above `pos`, m, and its tilts about X and Y, rad, and four
-    controls, the heights wanted of the corners. Its own weight is carried.
-
-    Attributes:
-        name: how the scene calls it.
-        size: `(x, y)` m.
-        pos: m, the middle of its upper face at rest.
-        mass: kg.
-        stiffness: N/m, of each corner.
-        damping: N s/m, of each corner.
-    """
-
-    name: str = "trampoline"
-    size: Annotated[tuple[float, float], Range(0, above=True)] = (2.4, 2.4)
-    pos: Vector = (0.0, 0.0, 0.0)
-    mass: Positive = 20.0
-    stiffness: Positive = 4000.0
-    damping: Positive = 120.0
-
-    def add(self, spec: mujoco.MjSpec) -> None:
-        """Adds one body on a slide and two hinges, and its actuators "NAME/0" to "NAME/3"."""
-        half, (x, y) = 0.02, self.size
-        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), gravcomp=1.0)
-        for kind, name, axis in (("SLIDE", "z", 2), ("HINGE", "x", 0), ("HINGE", "y", 1)):
-            along = [float(i == axis) for i in range(3)]
-            joint = getattr(mujoco.mjtJoint, f"mjJNT_{kind}")
-            body.add_joint(name=f"{self.name}/{name}", type=joint, axis=along)
-        solid(body, self.name, "box", [x / 2, y / 2, half], pos=[0.0, 0.0, -half], mass=self.mass)
-        for k, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
-            name, corner = f"{self.name}/{k}", [sx * x / 2, sy * y / 2, 0.0]
-            body.add_site(name=name, pos=corner)
-            foot = [a + b for a, b in zip(self.pos, corner, strict=True)]
-            spec.worldbody.add_site(name=f"{name}/foot", pos=foot)
-            servo = spec.add_actuator(
-                name=name,
-                target=name,
-                refsite=f"{name}/foot",
-                trntype=mujoco.mjtTrn.mjTRN_SITE,
-                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                gear=[0, 0, 1, 0, 0, 0],
-            )
-            servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = (
-                self.stiffness,
-                -self.stiffness,
-                -self.damping,
-            )

@@ -19,13 +19,12 @@ from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.standing import ClipWorld
 from poise.kinematics.steps import lock_feet, planted, stepped
 from poise.learn.between import Between
-from poise.learn.inbetween import Adaptation, InbetweenModel, adapt
+from poise.learn.inbetween_model import Adaptation, InbetweenModel, adapt
 from poise.learn.transition import FilledGap, Known
 from poise.learn.transition import FilledGap as Transition
 from poise.motion.clip import Clip
 from poise.motion.roles import map_joints
 from poise.motion.rotations import (
-    forward_kinematics,
     normalize,
     quat_between,
     quat_mul,
@@ -135,7 +134,11 @@ class OtherRig:
         return self._passed(self.example, self.back, path)
 
     def changed(self, known: Motion, filled: Motion) -> Motion:
-        """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it."""
+        """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it.
+
+        With P the passage there and B the passage back, x B(P(x))^-1 B(f), joint by joint and likewise
+        for the root's place: where the network changes nothing, the clip stays to the last digit.
+        """
         before, after = self.to_clip(self.to_model(known)), self.to_clip(filled)
         root = known[0] + after[0] - before[0]
         turn = quat_between(before[1], after[1])
@@ -143,9 +146,7 @@ class OtherRig:
 
     @staticmethod
     def _passed(clip: Clip, passage: Retargeter, path: Motion) -> Motion:
-        skeleton = clip.skeleton
-        world = ClipWorld(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
-        rot, root = passage.transfer(world)
+        rot, root = passage.transfer(ClipWorld(*clip.skeleton.forward(*path)))
         return root, unwrap_quats(normalize(rot))
 
 

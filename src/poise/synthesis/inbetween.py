@@ -15,7 +15,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.formats.own import unpack_clips
 from poise.kinematics.directed import LIMBS, PELVIS, TouchPoint, end_of
 from poise.kinematics.feet import off_floor, standing_heights, under_floor
-from poise.learn.inbetween import InbetweenModel
+from poise.learn.inbetween_model import InbetweenModel
 from poise.motion import Clip
 from poise.motion.rotations import slerp
 from poise.motion.windows import foot_joints, still_root, without_still_root

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +15,6 @@ from poise.kinematics.steps import hermite
 from poise.motion import Skeleton
 from poise.motion.rotations import (
     GRAVITY,
-    forward_kinematics,
     normalize,
     quat_conj,
     quat_mul,
@@ -25,6 +23,7 @@ from poise.motion.rotations import (
     slerp,
     unwrap_quats,
 )
+from poise.motion.smoothing import smoothstep
 
 #: m/s, the fastest of a thousand frames of each part in CMU's motions and DeepMimic's (30 Hz, 62 clips).
 FASTEST = {
@@ -63,8 +62,7 @@ def fastest(skeleton: Skeleton) -> Tensor:
 
 def excess(skeleton: Skeleton, limits: Tensor, motion: Motion, fps: float) -> tuple[float, int]:
     """By how much the fastest joint goes beyond its limit, as a factor, and which one it is."""
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
-    pos = forward_kinematics(skeleton.parents, offsets, *motion)[0]
+    pos = skeleton.forward(*motion)[0]
     over = (pos.diff(dim=0).norm(dim=-1) * fps).amax(0) / limits
     joint = int(over.argmax())
     return float(over[joint]), joint
@@ -349,7 +347,7 @@ def spread(ends: tuple[Tensor, Tensor], made: tuple[Tensor, Tensor]) -> tuple[Te
     if n < 2:
         return root.clone(), rot.clone()
     t = torch.arange(1, n + 1, dtype=root.dtype) / (n + 1)
-    ease = t * t * (3 - 2 * t)
+    ease = smoothstep(t)
     shift, turn = torch.zeros_like(root), torch.zeros(n, rot.shape[1], 3, dtype=rot.dtype)
     for k, (a, b), weight in ((0, (1, 0), 1 - ease), (1, (n - 2, n - 1), ease)):
         place, pose = _ahead_seams(root, rot, a, b)
@@ -394,7 +392,7 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
         # y(i) += s(i) (x(n+1) - (2 y(n) - y(n-1))),  s from 0 to 1 along a smooth step
         t = (torch.arange(n, dtype=root.dtype) - (n - 1 - min(blend, n - 1))).clamp_min(0)
         t = t / (min(blend, n - 1) + 1)
-        ease = t * t * (3 - 2 * t)
+        ease = smoothstep(t)
         place, pose = _ahead_seams(root, rot, before + n - 2, before + n - 1)
         shift += ease[:, None] * (root[before + n] - place)
         turn += ease[:, None, None] * quat_to_rotvec(quat_mul(rot[before + n], quat_conj(pose)))

@@ -14,6 +14,7 @@ from poise.kinematics.repair.doctor import examine, heal
 from poise.kinematics.repair.faults import KINDS
 from poise.motion import Clip
 from poise.motion.rotations import slerp
+from poise.motion.smoothing import smoothstep
 from poise.synthesis.filler import Filler, Gap
 from poise.synthesis.limits import Calmed, Feet, excess
 
@@ -194,7 +195,7 @@ def _mend(
         t = torch.arange(1, gap.b - gap.a, dtype=root.dtype)
         near = torch.minimum(t, gap.b - gap.a - t) / filler.own.fps
         share = (near / FADE_S).clamp_max(1.0)
-        share = (share * share * (3 - 2 * share))[:, None]
+        share = smoothstep(share)[:, None]
         tried_root[rows] = torch.lerp(root[rows], torch.tensor(healed.root_pos[rows]), share)
         other = torch.tensor(healed.rot[rows])
         tried_rot[rows] = slerp(rot[rows], other, share.expand(other.shape[:2]))

@@ -88,7 +88,7 @@ def test_paper_and_code_differ_where_they_do():
 
 def test_episodes_begin_in_their_kinds_at_their_odds(built):
     env = env_of(built, 60, replace(QUICK, fallen=0.3, far=0.2))
-    r, state = env.plugin(RecoveryClock), env.backend.state
+    r, state = env.event(RecoveryClock), env.backend.state
     assert r is not None
     drawn = r.kinds(4000, torch.Generator().manual_seed(0))
     fallen, far = (drawn & FALLEN).bool(), (drawn & FAR).bool()
@@ -117,7 +117,7 @@ def test_the_reference_waits_for_the_fallen_alone(built):
     for _ in range(5):
         env.step(rest(env))
         frames.append(env.frame.tolist())
-        goals.append((env.goal.row() - env.reference.rows(env.clip, env.frame)).tolist())
+        goals.append((env.goal.clips.row - env.reference.rows(env.clip, env.frame)).tolist())
     # Three steps of grace; after the last of them the reference goes on.
     assert frames == [[6, 5, 6], [7, 5, 7], [8, 5, 8], [9, 6, 9], [10, 7, 10]]
     assert goals == [[1, 0, 1], [1, 0, 1], [1, 1, 1], [1, 1, 1], [1, 1, 1]]
@@ -136,7 +136,7 @@ def test_who_recovers_cannot_fail_and_fails_again_once_settled(built):
     for _ in range(5):
         move(env, 0.0 * off)
         step = env.step(rest(env))
-        clock = env.plugin(RecoveryClock)
+        clock = env.event(RecoveryClock)
         assert clock is not None
         spare.append(int(clock.spare[0]))
     # 2 steps near, and one more after which failures count.
@@ -162,7 +162,7 @@ def test_failures_go_on_at_their_odds_and_the_reference_waits_where_it_was_going
     env.reset_to(*at(400, 7))
     move(env, torch.tensor([0.0, 3.0, 0.0]).expand(400, 3))
     step = env.step(rest(env))
-    clock = env.plugin(RecoveryClock)
+    clock = env.event(RecoveryClock)
     assert clock is not None
     on = (clock.kind & CONTINUED).bool()
     assert float(on.float().mean()) == pytest.approx(0.4, abs=0.07)
@@ -258,7 +258,7 @@ def test_the_point_goals_reward_by_hand(built):
     env = env_of(built, 3, auto_reset=False)
     env.reset_to(*at(3, 4))
     move(env, torch.tensor([[0.0, 0.1, 0.0], [0.0, 3.0, 0.0], [0.0, 9.0, 0.0]]))
-    clock = env.plugin(RecoveryClock)
+    clock = env.event(RecoveryClock)
     assert clock is not None
     clock.before.copy_(torch.tensor([0.3, 3.1, 8.0]))
     step = env.step(rest(env))
@@ -266,7 +266,7 @@ def test_the_point_goals_reward_by_hand(built):
     point, energy = env.terms["point_goal"], env.terms["energy_far"]
     expected = [0.0, 3.1 - float(now[1]), 8.0 - float(now[2])]
     torch.testing.assert_close(point, torch.tensor(expected), atol=1e-5, rtol=0)
-    torch.testing.assert_close(env.plugin(RecoveryClock).before, now)
+    torch.testing.assert_close(env.event(RecoveryClock).before, now)
     # Imitation counts near the reference alone.
     assert env.terms["body_velocities"].gt(0).tolist() == [True, False, False]
     assert env.imitation.gt(0).tolist() == [True, False, False]
@@ -316,13 +316,13 @@ def test_state_continues_bit_for_bit(built):
     other.load_state(saved)
     ours, theirs = rollout(clips, 25, 1), rollout(other, 25, 1)
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    assert clips.plugin(RecoveryClock) is not None and other.plugin(RecoveryClock) is not None
-    assert len(clips.plugin(RecoveryClock).kind.unique()) > 2
-    assert torch.equal(clips.plugin(RecoveryClock).table, other.plugin(RecoveryClock).table)
+    assert clips.event(RecoveryClock) is not None and other.event(RecoveryClock) is not None
+    assert len(clips.event(RecoveryClock).kind.unique()) > 2
+    assert torch.equal(clips.event(RecoveryClock).table, other.event(RecoveryClock).table)
     # A state from before recovery goes on as tracked.
     old = {k: v for k, v in saved.items() if k not in ("recovery", "falls")}
     other.load_state(old)
-    assert not other.plugin(RecoveryClock).table.any()
+    assert not other.event(RecoveryClock).table.any()
     clips.close()
     other.close()
 
@@ -359,7 +359,7 @@ def test_a_task_without_recovery_is_as_before(built, make_phc):
     """Odds of 0 and no world far: the same numbers as without any recovery, bit for bit."""
     task = make_phc(WALK)
     plain = task.env(6, 3, False, threads=1)
-    assert plain.plugin(RecoveryClock) is None and "recovery" not in plain.state()
+    assert plain.event(RecoveryClock) is None and "recovery" not in plain.state()
     with refused("recovery-off"):
         plain.reset_to(*at(6, 0), torch.full((6,), FALLEN))
     never = Recovery(0.0, 0.0, 0.0, switch=50.0, reach=60.0)

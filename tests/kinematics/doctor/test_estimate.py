@@ -14,8 +14,9 @@ from scipy.signal import butter, sosfiltfilt
 from poise.formats import read_clip
 from poise.formats.point_fit import fit_clip
 from poise.kinematics import anatomy_of, examine, heal, support_of
-from poise.kinematics.hold import _lasting, mend_slides
+from poise.kinematics.hold import mend_slides
 from poise.kinematics.repair import estimate as clean
+from poise.kinematics.repair import support
 from poise.kinematics.repair.estimate import clean_clip, denoise, find_lost, noise_faults, refill
 from poise.kinematics.repair.faults import Fault
 from poise.kinematics.repair.support import slide_faults
@@ -284,7 +285,7 @@ def test_a_foot_that_swings_through_near_the_floor_is_not_held(walk: Clip) -> No
 def test_a_run_is_held_less_than_a_walk() -> None:
     t = np.arange(120) / 30.0
     stands = np.stack([np.sin(2 * np.pi * hz * t) > 0 for hz in (0.5, 2.5)], 1).astype(float)
-    lasting = _lasting(stands)
+    lasting = support.lasting(stands)
     # A second, and a fifth of one; nothing elsewhere.
     assert lasting[5, 0] == pytest.approx(30, abs=1) and lasting[3, 1] == pytest.approx(6, abs=1)
     assert (lasting[stands < 0.5] == 1).all()

@@ -80,14 +80,14 @@ def test_an_opponent_out_of_reach_moves_as_if_it_were_alone(tracker: Tracker, ta
     assert 0.6 * APART_M < float(rival.reference.qpos[0, 0]) < 1.4 * APART_M
     given = Compliance(0.1)
     own = replace(
-        task.task, plugins=(*stage.plugins, opposing(far, tracker, given)), compliance=given, dones=()
+        task.task, events=(*stage.events, opposing(far, tracker, given)), compliance=given, dones=()
     )
     made = replace(task, task=own, props=stage.props, touches=stage.touches)
     env = made.env(2, threads=1, auto_reset=False, help_scale=0.0, guard=False)
-    lone = replace(far, task=replace(far.task, plugins=())).env(
+    lone = replace(far, task=replace(far.task, events=())).env(
         1, threads=1, auto_reset=False, help_scale=0.0, guard=False
     )
-    opposing_one = env.plugin(Opposing)
+    opposing_one = env.event(Opposing)
     assert opposing_one is not None
     zero = torch.zeros(2, dtype=torch.long)
     obs, other = env.reset_to(zero, zero), lone.reset_to(zero[:1], zero[:1])

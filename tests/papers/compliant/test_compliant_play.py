@@ -13,7 +13,7 @@ from poise.control import Stiffness
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.papers.compliant.play import WORDS, play
+from poise.papers.compliant.scene_play import WORDS, play
 from poise.papers.compliant.scenes import (
     Balance,
     Chicken,

@@ -15,9 +15,8 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.papers.compliant.play import play
-from poise.papers.compliant.scenes.ball import FictionalForces
-from poise.papers.compliant.training import (
+from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.scene_training import (
     Added,
     Compliant,
     OnTop,
@@ -27,6 +26,7 @@ from poise.papers.compliant.training import (
     shipped,
     train,
 )
+from poise.papers.compliant.scenes.ball import FictionalForces
 from refusals import refused
 
 PPO = PPOConfig(
@@ -61,7 +61,7 @@ def test_what_is_on_top_adds_to_what_is_below(tracker: Tracker) -> None:
     given = env.given.clone()
     given[1, 0] -= 0.05
     torch.testing.assert_close(given, below, atol=1e-5, rtol=1e-5)
-    forces = env.plugin(FictionalForces)
+    forces = env.event(FictionalForces)
     assert forces is not None and forces.asked is not None and forces.asked[1].tolist()[1] == 1.0
     top.close()
 

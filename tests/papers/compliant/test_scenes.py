@@ -12,8 +12,8 @@ from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, ScenePart
 from poise.env.pushes import Push
+from poise.env.scene import InScene, ScenePart
 from poise.env.yielding import DisplacedGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run
@@ -47,7 +47,7 @@ def task() -> Imitation:
 
 def test_a_partner_goes_as_the_motion_goes(task: Imitation) -> None:
     stage = HandInHand(lead=0.2, sway=0.1).stage(task.humanoid, task.reference)
-    (prop,), (link,), (part,) = stage.props, stage.links, stage.plugins
+    (prop,), (link,), (part,) = stage.props, stage.links, stage.events
     assert isinstance(part, InScene) and part.felt == (link.name,)
     assert (link.a, link.b) == (prop.name, "lwrist")
     path = part.events[0].path  # type: ignore[attr-defined]
@@ -65,7 +65,7 @@ def test_a_partner_goes_as_the_motion_goes(task: Imitation) -> None:
 
 
 def test_a_pull_and_throws(task: Imitation) -> None:
-    (push,) = PullScene(30.0, "right", (0.0, 0.0, -2.0)).stage(task.humanoid, task.reference).plugins
+    (push,) = PullScene(30.0, "right", (0.0, 0.0, -2.0)).stage(task.humanoid, task.reference).events
     assert isinstance(push, Push) and push.force == (0.0, 0.0, -30.0) and push.first == 15
     assert task.humanoid.bodies[push.row] == "rwrist"
     stage = Throws(mass=2.0).stage(task.humanoid, task.reference)
@@ -142,7 +142,7 @@ def test_a_door_that_nobody_gets_through(task: Imitation) -> None:
 
 def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> None:
     stage = TrampolineScene(0.1).stage(task.humanoid, task.reference)
-    (plate,), (part,) = stage.props, stage.plugins
+    (plate,), (part,) = stage.props, stage.events
     # Under the middle of what the motion crosses.
     way = task.reference.pose.pos[:, 0, :2]
     assert plate.pos[:2] == pytest.approx((0.5 * (way.amin(0) + way.amax(0))).tolist(), abs=1e-5)
@@ -157,7 +157,7 @@ def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> Non
     ctrl = sim.backend.drive.ctrl[:, place.controls]
     up = list[int]()
     for step in range(150):
-        bounce.before()
+        bounce.before_step(sim.backend.drive)
         if bool((ctrl == 0.1).all()):
             up.append(step)
         else:
@@ -172,7 +172,7 @@ def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> Non
     assert isinstance(stage.yields(None), Compliance) and not stage.yields(None).root
     # Contacts are felt for a second from the one that follows the air.
     one = torch.ones(2, 3).double()
-    part_of = SimpleNamespace(happenings=[bounce])
+    part_of = SimpleNamespace(events=[bounce])
     assert not trampoline.after_contact(part_of, one).any()  # type: ignore[arg-type]
     bounce.gives[1] = 5
     assert trampoline.after_contact(part_of, one)[:, 0].tolist() == [0.0, 1.0]  # type: ignore[arg-type]
@@ -188,12 +188,12 @@ def _far_off(task: Imitation) -> tuple[Tensor, Tensor]:
 def test_a_ball_on_the_head(task: Imitation) -> None:
     scene = Balance(spread=0.1, gain=0.0, damping=0.0, pushes=50.0)
     stage = scene.stage(task.humanoid, task.reference)
-    own = replace(task.task, plugins=stage.plugins, compliance=stage.yields(None), dones=())
+    own = replace(task.task, events=stage.events, compliance=stage.yields(None), dones=())
     made = replace(task, task=own, props=stage.props, links=stage.links, config=task.config)
     env = made.env(3, threads=1, auto_reset=False, help_scale=0.0, guard=False)
     zero = torch.zeros(3, dtype=torch.long)
     env.reset_to(zero, zero)
-    forces, part = env.plugin(ball.FictionalForces), env.plugin(ScenePart)
+    forces, part = env.event(ball.FictionalForces), env.event(ScenePart)
     assert forces is not None and part is not None
     cosine = ball.upright_of(part.sim)
     assert bool((cosine > math.cos(0.15)).all()) and bool((cosine < 1.0).any())

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.jobs.perpetual import run as perpetual_result
+from poise.jobs.perpetual import perpetual_run as perpetual_result
 from poise.jobs.perpetual import stage_trainer as perpetual_judge
-from poise.jobs.perpetual.run import PerpetualResult, begin, train
+from poise.jobs.perpetual.perpetual_run import PerpetualResult, begin, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.perpetual.stages import Progress
 from poise.jobs.run_file import FINAL

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.jobs.perpetual.run import begin, train
+from poise.jobs.perpetual.perpetual_run import begin, train
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
 from poise.motion import ClipLibrary
 from poise.papers.perpetual.primitive_stages import PATHS
 from poise.papers.perpetual.trajopt import TrajOptConfig, TrajOptStats
+from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual_settings import config_of
-from poise.recipes.shapes import BodyShapes
 from poise.settings import to_data
 from refusals import refused
 from toy_human import swing

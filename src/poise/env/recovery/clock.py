@@ -13,10 +13,9 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.control import PDTargets
 from poise.env import frame as observables
+from poise.env.events import EpisodeStart, Event, StepOutcome
 from poise.env.frame import Frame, LazyPose, Observable, PointGoal, Pose, PoseLayout
-from poise.env.plugins import Plugin
 from poise.env.recovery.falls import Drop, fall_states, rest_angles
-from poise.env.reference import Start
 from poise.errors import PoiseError
 from poise.settings import Range, Share, validate
 from poise.sim import Backend
@@ -141,7 +140,7 @@ def toward(sim: Pose, goal: Pose, far: Tensor, reach: float) -> Pose:
     )
 
 
-class RecoveryClock(Plugin):
+class RecoveryClock(Event):
     """The recoveries of an environment's worlds.
 
     Attributes:
@@ -193,9 +192,9 @@ class RecoveryClock(Plugin):
 
     # --- what terms see -----------------------------------------------------------------------
 
-    @property
-    def observables(self) -> Mapping[str, Observable]:
-        """Where the reference's root is, and a goal that is a point where that is far."""
+    def tells(self) -> Mapping[str, Tensor | Observable]:
+        """Where the reference's root is, a goal that is a point where that is far, and episodes that
+        cannot end."""
 
         def point(frame: Frame) -> PointGoal:
             before = frame.source("recovery")[:, 2]
@@ -206,23 +205,22 @@ class RecoveryClock(Plugin):
             assert goal is not None and frame.point is not None
             return toward(frame.sim, goal, frame.point.far, self.config.reach)
 
-        return {"point": point, "ahead": ahead}
+        def spared(frame: Frame) -> Tensor:
+            return frame.source("recovery")[:, 1] != 0
 
-    def sources(self) -> Mapping[str, Tensor]:
-        return {"recovery": self.table}
+        return {"point": point, "ahead": ahead, "spared": spared, "recovery": self.table}
 
     # --- starts -------------------------------------------------------------------------------
 
     def kinds(self, count: int, rng: torch.Generator) -> Tensor:
+        """`(count,)` kinds of new episodes, drawn."""
         u, c = torch.rand(count, 2, dtype=torch.float64, generator=rng), self.config
         return FALLEN * (u[:, 0] < c.fallen) + FAR * (u[:, 1] < c.far)
 
-    def start(
-        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
-    ) -> Start:
-        """Episodes of some kinds `(n,)`; begins them fallen, far, or on the reference."""
-        qpos, qvel = start
-        rows = slice(None) if ids is None else ids
+    def begin(self, episodes: EpisodeStart) -> None:
+        """Begins episodes fallen, far, or on the reference, by their kinds."""
+        (qpos, qvel), rng, rows = episodes.start, episodes.rng, episodes.rows
+        kind = self.kinds(len(qpos), rng) if episodes.drawn else episodes.kind
         kind = torch.zeros(len(qpos), dtype=torch.long) if kind is None else kind.cpu()
         # As many draws whatever the kinds, so that one episode's kind does not move the others.
         c, u = self.config, torch.rand(len(kind), 3, dtype=torch.float64, generator=rng)
@@ -241,7 +239,7 @@ class RecoveryClock(Plugin):
         self.table[rows, 1] = ((c.settle + 1) * (kind > 0)).to(self.table)
         self.table[rows, 2] = (place[:, :3] - qpos[:, :3]).norm(dim=-1).to(self.table)
         self.table[rows, 3] = kind.to(self.table)
-        return place, qvel
+        episodes.start = place, qvel
 
     # --- stepping -----------------------------------------------------------------------------
 
@@ -254,21 +252,21 @@ class RecoveryClock(Plugin):
         far = self.before > self.config.switch
         return torch.where(far.unsqueeze(-1), self._rest.to(hinges), hinges)
 
-    def tick(self) -> None:
+    def after_step(self) -> None:
         self.grace.sub_(1.0).clamp_min_(0.0)
 
-    def ends(self, frame: Frame, failed: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
-        free = frame.source("recovery")[:, 1] == 0
-        return failed & free, done & free
-
-    def judged(self, ends: Tensor, ref: Tensor, late: Tensor, rng: torch.Generator | None) -> None:
-        apart = root_distance(self._layout.unpacked(ref).pos, self._made_with[0].state.xpos[:, 1:])
-        self.reached(apart)
-        if rng is not None:
-            failed, terminated, truncated = ends.unbind(0)
-            ids = self.survive(failed, rng)
+    def judged(self, outcome: StepOutcome) -> None:
+        ref = self._layout.unpacked(outcome.ref).pos
+        self.reached(root_distance(ref, self._made_with[0].state.xpos[:, 1:]))
+        if outcome.rng is not None:
+            failed, terminated, truncated = outcome.ends.unbind(0)
+            ids = self.survive(failed, outcome.rng)
             failed[ids] = terminated[ids] = False
-            truncated[ids] = late[ids]
+            truncated[ids] = outcome.late[ids]
+        # Episodes that recover, or have recovered, have not been where their age says.
+        outcome.counted = self.kind == 0
+        far = self.before > self.config.switch
+        outcome.log |= {"recovery/far": far.float(), "recovery/waiting": self.held().float()}
 
     def reached(self, distance: Tensor) -> None:
         """The step led to these distances between the roots, m `(N,)`: near ones settle."""
@@ -287,17 +285,10 @@ class RecoveryClock(Plugin):
         self._kind[ids] = (self.kind[ids] | CONTINUED).to(self.table)
         return ids
 
-    def counted(self) -> Tensor:
-        """Episodes that recover, or have recovered, have not been where their age says."""
-        return self.kind == 0
-
     def past(self, rows: Tensor) -> Tensor:
-        """Fallen characters have not come to lie with the clip."""
+        """`(n,)` bool of worlds `rows (n,)` that have no past in their clips: fallen characters have not
+        come to lie with them."""
         return (self.kind[rows] & FALLEN).bool()
-
-    def log(self) -> Mapping[str, Tensor]:
-        far = self.before > self.config.switch
-        return {"recovery/far": far.float(), "recovery/waiting": self.held().float()}
 
     # --- persistence --------------------------------------------------------------------------
 

@@ -118,6 +118,8 @@ class Recovering(Goal):
         aimed: coordinates `(N, 7 + n)` that the last step acted toward.
     """
 
+    watches = True
+
     def __init__(
         self,
         goal: ClipGoal | GeneratorGoal,
@@ -128,7 +130,8 @@ class Recovering(Goal):
     ):
         self.goal, self.chained, self.returns, self.plans = goal, chained, returns, plans
         self.humanoid, self.bodies, self.rate_hz = goal.humanoid, goal.bodies, goal.rate_hz
-        self.layout, self.num_envs, self.device = goal.layout, goal.num_envs, goal.device
+        self.layout, self.local = goal.layout, goal.local
+        self.num_envs, self.device = goal.num_envs, goal.device
         self.rng, self.notes, self.begins = goal.rng, goal.notes, goal.begins
         self.get_up = None
         if recovery_clips is not None:
@@ -148,9 +151,6 @@ class Recovering(Goal):
         self._tail = goal.generator.past if isinstance(goal, GeneratorGoal) else 1
         self.aimed = self._qpos
 
-    def local(self, qpos: Tensor) -> Tensor:
-        return self.goal.local(qpos)
-
     @property
     def clips(self) -> ClipGoal:
         return self.goal.clips
@@ -162,19 +162,13 @@ class Recovering(Goal):
 
     # --- episodes -----------------------------------------------------------------------------
 
-    def draw(self, ids: Tensor) -> None:
-        self.goal.draw(ids)
-        self._begin(ids)
-
-    def seek(self, clip: Tensor, frame: Tensor) -> None:
-        self.goal.seek(clip, frame)
-        self._begin(self._every)
-
-    def _begin(self, ids: Tensor) -> None:
+    def reset(self, ids: Tensor | None, clip: Tensor | None = None, frame: Tensor | None = None) -> None:
+        self.goal.reset(ids, clip, frame)
+        ids = self._every if ids is None else ids
         self._phases.begin(ids)
         self._on[ids] = False
 
-    def start(self, ids: Tensor | None, later: int = 0) -> Start:
+    def start(self, ids: Tensor | None = None, later: int = 0) -> Start:
         qpos, qvel = self.goal.start(ids, later)
         rows, which = self._rows(ids, later)
         if len(rows):
@@ -185,13 +179,7 @@ class Recovering(Goal):
         self._wait()
         self.goal.aim(ids, held)
 
-    def body(self, ids: Tensor | None) -> Tensor:
-        return self.goal.body(ids)
-
     # --- frames -------------------------------------------------------------------------------
-
-    def now(self, ids: Tensor | None = None) -> Tensor:
-        return self._told(self.goal.now(ids), ids, 0)
 
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         return self._told(self.goal.ahead(k, ids), ids, k)

@@ -185,7 +185,7 @@ def _go_about(
             simulated=config.past == "simulated",
         )  # fmt: skip
         own = Recovering(motion, clips, plans=plans)
-        own.draw(torch.arange(worlds))
+        own.reset(torch.arange(worlds))
         return own
 
     # The body's own task; what it follows is the goal.

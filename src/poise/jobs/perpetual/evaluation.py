@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
@@ -22,6 +22,7 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import standing
 from poise.recipes.perpetual_settings import Perpetual
 from poise.score import ClipJudge, ClipResults, RecoveryCard, recovery_card, simulate, trial_task
+from poise.score.episodes import Observer
 from poise.sim import make_backend
 
 #: The file of a run folder with every evaluation of every clip.
@@ -47,6 +48,7 @@ def evaluate_clips(
     worlds: int = WORLDS,
     on_batch: Callable[[int, int], None] | None = None,
     starts: int = 1,
+    observers: Sequence[Observer] = (),
 ) -> ClipResults:
     """Simulates `clips (E,)`, all by default, from their first frames with the deterministic policy.
 
@@ -55,7 +57,7 @@ def evaluate_clips(
             them, and its frames are those of all.
         help_scale: what is left of the residual force's limits, or of those of each clip or motion bin
             of the library, as the task's `help_by` says.
-        on_batch: told how many of how many clips are done.
+        on_batch: told how many of how many clips are done. observers: see each step, too.
     """
     reference = imitation.reference
     length, second = reference.length.cpu(), round(reference.rate_hz)
@@ -69,7 +71,8 @@ def evaluate_clips(
     order = (length[clip] - frame).argsort(stable=True)
     parts: list[tuple[Tensor, ...]] = []
     for rows in order.split(worlds):
-        parts.append(_batch(imitation, policy, clip[rows], frame[rows], help_scale, threads, device))
+        at = clip[rows], frame[rows]
+        parts.append(_batch(imitation, policy, *at, help_scale, threads, device, observers))
         if on_batch is not None:
             on_batch(sum(len(p[0]) for p in parts) // starts, len(clips))
     back = order.argsort()
@@ -88,6 +91,7 @@ def _batch(
     scale: float | Tensor,
     threads: int,
     device: str,
+    observers: Sequence[Observer],
 ) -> tuple[Tensor, ...]:
     """Success, frames tracked, mean errors `(E,)` of episodes that are simulated together."""
     task = imitation.bare(groups=isinstance(scale, Tensor))
@@ -96,7 +100,10 @@ def _batch(
     last = imitation.reference.length.to(env.device)[clip] - 1 - frame
     judge = ClipJudge(last)
     try:
-        simulate(env, policy, env.reset_to(clip, frame), int(last.max()), judge)
+        # A controller that looks ahead does so from this world.
+        if callable(watch := getattr(policy, "watch", None)):
+            watch(env)
+        simulate(env, policy, env.reset_to(clip, frame), int(last.max()), judge, *observers)
     finally:
         env.close()
     return judge.results()

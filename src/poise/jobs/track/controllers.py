@@ -27,7 +27,7 @@ from poise.score.episodes import ContactForces, Recording
 from poise.score.rollouts import EpisodeOutcomes, RolloutSet, judge
 
 if TYPE_CHECKING:
-    from poise.jobs.track.settings import TrackConfig
+    from poise.jobs.track_settings import TrackConfig
 
 
 #: Is told what is done, and how many control steps of how many are done.

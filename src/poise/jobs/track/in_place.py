@@ -13,7 +13,7 @@ from poise.kinematics.travel import Travel, find_travel, in_place, path_of, trav
 from poise.motion import Clip
 
 if TYPE_CHECKING:
-    from poise.jobs.track.settings import Mode
+    from poise.jobs.track_settings import Mode
 
 #: A loop is simulated for this long (s), as at least and at most so many periods.
 LOOP_S, LEAST, MOST = 4.0, 4, 10

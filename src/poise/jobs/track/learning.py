@@ -12,7 +12,7 @@ import torch
 from poise.env import Reference
 from poise.jobs.open import policy_of_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.perpetual.run import PerpetualResult, begin, going_on, train
+from poise.jobs.perpetual.perpetual_run import PerpetualResult, begin, going_on, train
 from poise.jobs.perpetual.stages import Progress
 from poise.jobs.result import RULE, Result, needs_of
 from poise.jobs.run_file import RUN_FILE, read_run

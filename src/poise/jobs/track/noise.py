@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.track.settings import Controller, TrackConfig
 from poise.jobs.track.tracking import track
+from poise.jobs.track_settings import Controller, TrackConfig
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints

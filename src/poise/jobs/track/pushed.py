@@ -136,16 +136,16 @@ def with_push(imitation: Imitation, push: PushConfig | None) -> Imitation:
     unit = np.asarray(way, dtype=float) / np.linalg.norm(way)
     x, y, z = (float(push.newtons * v) for v in unit)
     made = Push(row, (x, y, z), first, max(1, round(push.seconds * rate)))
-    task = replace(imitation.task, plugins=(*imitation.task.plugins, made), compliance=push.yields)
+    task = replace(imitation.task, events=(*imitation.task.events, made), compliance=push.yields)
     return replace(imitation, task=task)
 
 
 def unforeseen(imitation: Imitation) -> Imitation:
     """The same task for copies in which a controller looks ahead: they know of no push to come."""
-    plugins = tuple(
-        replace(p, foreseen=False) if isinstance(p, Push) else p for p in imitation.task.plugins
+    events = tuple(
+        replace(p, foreseen=False) if isinstance(p, Push) else p for p in imitation.task.events
     )
-    return replace(imitation, task=replace(imitation.task, plugins=plugins))
+    return replace(imitation, task=replace(imitation.task, events=events))
 
 
 def row_of(table: BodyTable, at: str) -> int:
@@ -220,7 +220,7 @@ class PushSeen:
         """Keeps the frame `step`; it never needs more of them."""
         from poise.env.yielding import Yielding
 
-        part, yielding, goal = env.plugin(OnePush), env.plugin(Yielding), env.goal
+        part, yielding, goal = env.event(OnePush), env.event(Yielding), env.goal
         assert part is not None and yielding is not None and isinstance(goal, DisplacedGoal)
         self._push, row = part.given, part.given.row
         acts = bool(part.acts[0])

@@ -9,17 +9,16 @@ import torch
 
 from poise.env import Acts
 from poise.errors import PoiseError
+from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.controllers import Show, StepProgress, look_ahead
 from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.tracker import Tracker
 from poise.kinematics.rate import RateJudgement, usual_rate
 from poise.motion import Clip
-from poise.plan import Lookahead
 from poise.recipes.imitation import Imitation
-from poise.score import ClipJudge, simulate
 
 if TYPE_CHECKING:
-    from poise.jobs.track.settings import TrackConfig
+    from poise.jobs.track_settings import TrackConfig
 
 
 #: The rates that a lost motion is tried at, over its own, if files have them within `USUAL`.
@@ -108,14 +107,6 @@ def _done_at(
 
 def _done(task: Imitation, acts: Acts, show: Show | None = None, what: str = "") -> bool:
     """Whether a task's first motion is done to its end, without help."""
-    last = task.reference.length[:1] - 1
-    env, first = task.bare().env(1, None, False, 1, help_scale=0.0, guard=False), torch.zeros_like(last)
-    judge = ClipJudge(last)
-    told = () if show is None else (StepProgress(what, int(last), show),)
-    try:
-        if isinstance(acts, Lookahead):
-            acts.watch(env)
-        simulate(env, acts, env.reset_to(first, first), int(last), judge, *told)
-    finally:
-        env.close()
-    return bool(judge.alive.all())
+    first = torch.zeros(1, dtype=torch.long)
+    told = () if show is None else (StepProgress(what, int(task.reference.length[0]) - 1, show),)
+    return bool(evaluate_clips(task, acts, first, 0.0, 1, observers=told).succeeded.all())

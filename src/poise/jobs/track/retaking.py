@@ -18,8 +18,8 @@ from poise.formats import read_clip
 from poise.jobs.result import RULE, Result, Way
 from poise.jobs.track.controllers import Show, StepProgress, TrackingRun, episode, look_ahead
 from poise.jobs.track.recovering import ReplayActions
-from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.simulation import FILE, Retake, Simulation, States
+from poise.jobs.track_settings import TrackConfig
 from poise.jobs.tracker import Tracker
 from poise.kinematics.travel import travelled
 from poise.metrics import has_lost, mpjpe_global, success_rule

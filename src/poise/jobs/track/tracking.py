@@ -44,8 +44,8 @@ from poise.jobs.track.pushed import with_push
 from poise.jobs.track.rates import rate_doubts, rate_notes
 from poise.jobs.track.recovering import RecoveryRun, cut, parts_of, with_parts
 from poise.jobs.track.retaking import as_it_was, retaken, write_simulation
-from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.supports import places, with_supports, write_supports
+from poise.jobs.track_settings import TrackConfig
 from poise.jobs.tracker import Tracker
 from poise.kinematics.directed import Pin, pinned
 from poise.kinematics.fit import widen

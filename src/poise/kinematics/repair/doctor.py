@@ -13,7 +13,7 @@ import torch
 from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kinematics.coords import chain_angles
-from poise.kinematics.hold import drifts, mend_path, mend_slides, steadied
+from poise.kinematics.hold import mend_path, mend_slides, steadied
 from poise.kinematics.loops import best_period, overlap_of, repeated
 from poise.kinematics.rate import judge_rate
 from poise.kinematics.repair.estimate import CleanReport, clean_clip, denoise, noise_faults
@@ -22,6 +22,7 @@ from poise.kinematics.repair.speeds import jitter_faults, mend_jitter
 from poise.kinematics.repair.support import (
     FloorPoints,
     anatomy_of,
+    drifts,
     height_faults,
     slide_faults,
     support_of,

@@ -20,7 +20,7 @@ from poise.kinematics.repair.timing import drift_faults
 from poise.kinematics.travel import Travel, told_by
 from poise.metrics import foot_contacts, foot_slide
 from poise.motion import Clip
-from poise.motion.smoothing import find_runs
+from poise.motion.smoothing import find_runs, gaussian
 
 #: How far (m) the estimated soles of a clip may be off the floor before the whole clip is: the file
 #: tells where ankles and toes are, not how thick the soles below them.
@@ -223,3 +223,129 @@ def foot_slips(support: FloorPoints) -> list[tuple[int, np.ndarray, np.ndarray]]
         touching = np.any(contact[:, mine], axis=-1, keepdims=True)
         out.append((foot, np.where(touching, chosen, 0.0), touching[:, 0]))
     return out
+
+
+#: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
+#: (m/s) that a rolling sole has anyway and that is left.
+COMMON_S, ROLL_SPEED = 0.4, 0.04
+#: The path drifts only where soles lie flat for so long (s) and slip with no more than this share of
+#: unsteadiness, each foot for this time (s) in all, and one foot tells this share of the other's slips.
+FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
+
+
+def drifts(support: FloorPoints) -> bool:
+    """Whether the path itself drifts: what slips is one motion of the floor, the same for both feet.
+
+    A foot tells where its whole sole is down for `FLAT_S` and slips steadily; one that rolls, pivots or
+    trembles does not. From the slips of either foot those of the other must follow, so that at least
+    `EXPLAINED` of their energy goes.
+    """
+    contact = support.contacts[1].numpy()
+    velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
+    told = []
+    for foot in dict.fromkeys(support.feet):
+        mine = np.flatnonzero(np.array(support.feet) == foot)
+        slip, weight = velocity[:, mine].mean(1), np.zeros(len(velocity))
+        turning = np.linalg.norm(velocity[:, mine] - slip[:, None], axis=-1).max(1)
+        for first, last in find_runs(np.all(contact[:, mine], axis=-1), 0):
+            run = slice(first, last + 1)
+            mean = slip[run].mean(0)
+            off = np.linalg.norm(slip[run] - mean, axis=-1) + turning[run]
+            size = float(np.linalg.norm(mean))
+            if last - first + 1 >= FLAT_S * support.fps and np.sqrt(np.mean(off**2)) <= STEADY * size:
+                weight[run] = 1.0
+        told.append((slip, weight))
+    if len(told) != 2 or min(weight.sum() for _, weight in told) < TOLD_S * support.fps:
+        return False
+    for (slip, weight), (other, here) in (told, told[::-1]):
+        guess, near = mean_near(other, here, support.fps)
+        both = (weight > 0) & (near > 0)
+        energy = float((slip[both] ** 2).sum())
+        left = float(((slip[both] - guess[both]) ** 2).sum())
+        if energy < ROLL_SPEED**2 * both.sum() or left > (1 - EXPLAINED) * energy or not both.any():
+            return False
+    return True
+
+
+def mean_near(slip: np.ndarray, weight: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """The mean `(T, 2)` of `slip (T, 2)` by `weight (T)` around every frame, and the weight there."""
+    kernel = gaussian(COMMON_S * fps)
+    parts = [np.pad(x, len(kernel) // 2) for x in (weight, slip[:, 0] * weight, slip[:, 1] * weight)]
+    total, *mean = (np.convolve(x, kernel, "valid") for x in parts)
+    return np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None], total
+
+
+#: What an end of a sole does that stands (deviations): m/s level, by axis, and of its rise; m of height.
+LEVEL_SPEED, RISE_SPEED, HEIGHT_M = 0.05, 0.06, 0.012
+#: The same of one that swings, at least; and so many times that of one that stands.
+SWING = (1.0, 0.5, 0.12)
+WIDER = 3.0
+#: How long (s) noise lasts, so that frames in it tell one thing, and a foot stands or swings.
+ALIKE_S, LASTS_S = 0.1, 0.4
+#: How often both are told.
+TOLD_ROUNDS = 4
+
+
+def stance(support: FloorPoints) -> tuple[np.ndarray, float, float]:
+    """How likely each end of a sole stands between frames `(T - 1, F)`, and the deviations of its level
+    speed (by axis) and of its rise while it does, m/s. Contacts that a file states stay.
+
+    Level velocity, rise and height over the floor, y, are each normal, wider (S) while an end swings:
+
+        log p(y | stands) / p(y | swings) = sum  d ln(S / s) - |y|^2 (1 / s^2 - 1 / S^2) / 2,
+
+    and a chain of two states joins the frames. The s are those of the frames that stand, told again with
+    them: the more noise is left, the faster and the higher may an end be that stands.
+    """
+    soles, fps = support.soles.numpy(), support.fps
+    velocity = np.diff(soles, axis=0) * fps
+    height = np.maximum(soles[1:, :, 2], soles[:-1, :, 2]) + support.fit.lift_m
+    stands, level, rise = support.contacts[1].numpy().astype(float), 0.0, 0.0
+    if support.labels is None:
+        # Where all that is near the floor is fast, a foot swings through; skating is no tremble.
+        stands *= support.contacts[0].numpy() <= SWING[0]
+    for _ in range(TOLD_ROUNDS):
+        total = stands.sum()
+        if total < 1.0:
+            break
+        floor = (stands * height).sum() / total
+        # Lower than the floor is on it.
+        parts = (velocity[..., :2], velocity[..., 2:], np.maximum(height - floor, 0.0)[..., None])
+        ratio, sizes = np.zeros_like(height), list[float]()
+        for y, own, least in zip(parts, (LEVEL_SPEED, RISE_SPEED, HEIGHT_M), SWING, strict=True):
+            square, count = (y**2).sum(-1), y.shape[-1]
+            spread = square if y is not parts[2] else (height - floor) ** 2
+            size = float(np.sqrt((stands * spread).sum() / (count * total) + own**2))
+            wide = max(least, WIDER * size)
+            ratio += count * np.log(wide / size) - 0.5 * square * (size**-2 - wide**-2)
+            sizes.append(size)
+        level, rise = sizes[:2]
+        if support.labels is not None:
+            break
+        stands = _joined(ratio / max(ALIKE_S * fps, 1.0), min(0.5, 1.0 / (LASTS_S * fps)))
+    return stands, level, rise
+
+
+def lasting(stands: np.ndarray) -> np.ndarray:
+    """`(T, F)` frames, how long each end stands around every frame by `stands (T, F)`; 1 elsewhere."""
+    out = np.ones_like(stands)
+    for k in range(stands.shape[1]):
+        for a, b in find_runs(stands[:, k] > 0.5, 0):
+            out[a : b + 1, k] = b - a + 1
+    return out
+
+
+def _joined(ratio: np.ndarray, change: float) -> np.ndarray:
+    """Probabilities `(T, F)` of the first of two states from their log ratios `(T, F)`, by the forward
+    and the backward pass of a chain that changes state with the probability `change` at every step."""
+
+    def passed(x: np.ndarray) -> np.ndarray:
+        out, before = np.empty_like(x), np.zeros(x.shape[1])
+        for t in range(len(x)):
+            share = change + (1.0 - 2.0 * change) / (1.0 + np.exp(-np.clip(before, -40.0, 40.0)))
+            out[t] = np.log(share / (1.0 - share))
+            before = out[t] + x[t]
+        return out
+
+    both = passed(ratio) + passed(ratio[::-1])[::-1] + ratio
+    return 1.0 / (1.0 + np.exp(-np.clip(both, -40.0, 40.0)))

@@ -13,7 +13,7 @@ from poise.kinematics.ground import ALOFT_M
 from poise.kinematics.repair.faults import Fault
 from poise.motion import Clip
 from poise.motion.rotations import quat_distance, slerp
-from poise.motion.smoothing import find_runs, gaussian
+from poise.motion.smoothing import find_runs, gaussian, smoothstep
 
 #: A frame repeats the one before if no joint turns and the root does not move by more than this.
 SAME_RAD, SAME_M = 1e-7, 1e-7
@@ -153,7 +153,7 @@ def mend_teleports(clip: Clip, low: np.ndarray | None = None) -> Clip:
             # The height was right on both sides: it is blended from one to the other around the jump.
             reach = max(2, round(0.1 * clip.fps))
             back = np.clip((np.arange(len(path)) - last + reach) / (2 * reach), 0.0, 1.0)
-            own[:, 2] -= (back * back * (3 - 2 * back)) * gap[2]
+            own[:, 2] -= smoothstep(back) * gap[2]
         shift += own
     return clip.replaced(root_pos=path + shift)
 

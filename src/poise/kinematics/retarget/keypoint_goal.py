@@ -112,8 +112,7 @@ class PointBody:
 
     def _onto(self, performer: ClipWorld) -> tuple[Tensor, Tensor]:
         rot, root = self.passage.transfer(performer)
-        offsets = torch.tensor(self.onto.offsets)
-        pos, quat = forward_kinematics(self.onto.parents, offsets, root, rot)
+        pos, quat = self.onto.forward(root, rot)
         rows = [r.joint for r in self.table.rows]
         return pos[:, rows], quat[:, rows]
 
@@ -190,6 +189,11 @@ class _Step(NamedTuple):
 
 class KeypointStream:
     """Keypoints one frame after another; goals at every control step that they reach.
+
+        body = PointBody.calibrate(first_seconds, humanoid_skeleton, humanoid.table)
+        stream = KeypointStream(body, rate_hz=30.0)
+        for frame in stream.follow(points):     # or: stream.push(positions, time_s) for every frame
+            frame.pos, frame.linvel             # (B, 3) m and m/s
 
     latency_s: how long after a control step its goal is given: until the next frame of the input is
     there, and `lookahead` steps more. The filter adds none at constant velocity.

@@ -66,6 +66,7 @@ class _Plan(NamedTuple):
         first: `(4)` the root's rotation, None where a joint of the source moves it.
         hanging: joints on their parents as at rest, those of one level together: joints, parents, turns.
         ways: of source and target, see `_way_to`.
+        back: `(J, 4)` the inverse of the source's common pose.
     """
 
     direct: tuple[np.ndarray, np.ndarray]
@@ -73,6 +74,7 @@ class _Plan(NamedTuple):
     first: np.ndarray | None
     hanging: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     ways: tuple[tuple[np.ndarray, np.ndarray], ...]
+    back: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,7 @@ class Retargeter:
         """The target's root `(..., 3)` m and world rotations `(..., J, 4)`, contacts as they come, for
         those of the source."""
         plan = self._plan
-        turned = q.mul(world, q.conj(self.here.rot))
+        turned = q.mul(world, plan.back)
         rest = self.there.rot
         out = np.empty((*world.shape[:-2], len(self.target), 4))
         onto, of = plan.direct
@@ -204,6 +206,7 @@ def _plan_of(joints: JointMap, here: CommonPose, there: CommonPose, share: bool)
         None if 0 in done else there.above[0],
         hanging,
         ways,
+        q.conj(here.rot),
     )
 
 

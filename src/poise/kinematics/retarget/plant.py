@@ -17,7 +17,7 @@ from poise.kinematics.retarget.passage import Retargeter
 from poise.kinematics.retarget.standing import ClipWorld
 from poise.motion import Clip
 from poise.motion.roles import SIDES
-from poise.motion.rotations import forward_kinematics, quat_rotate
+from poise.motion.rotations import quat_rotate
 from poise.motion.smoothing import smooth_lift
 
 #: Time (s) over which a foot goes from its own path to its contact and back.
@@ -104,7 +104,6 @@ def plant(
     is. The limbs are solved by two bones in closed form; feet and hands keep their turn.
     """
     skeleton, scale = passage.joints.target.skeleton, passage.scale
-    offsets = torch.tensor(skeleton.offsets)
     depth = passage.here.depth(world, scale.ground) * scale.factor
 
     def lift(pos: Tensor, quat: Tensor, parts: Collection[int]) -> Tensor:
@@ -116,11 +115,11 @@ def plant(
 
     if clear:
         ends = {j for foot in feet for j in subtree(skeleton, foot.target)}
-        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        pos, quat = skeleton.forward(root, rot)
         up = torch.zeros_like(root)
         up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
         root = root + up
-    pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+    pos, quat = skeleton.forward(root, rot)
     goals: dict[int | str, Tensor] = {}
     for k, foot in enumerate(feet):
         goal = pos[:, foot.target]
@@ -137,7 +136,7 @@ def plant(
     by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
     rot = match_positions(skeleton, rot, root, goals, by_end)
     if clear:
-        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        pos, quat = skeleton.forward(root, rot)
         up = torch.zeros_like(root)
         up[:, 2] = lift(pos, quat, range(len(skeleton)))
         root = root + up

@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.kinematics.retarget.passage import Retargeter, Scale, hip_middle
 from poise.kinematics.retarget.plant import Foot
 from poise.kinematics.retarget.standing import ClipWorld, body_axes
-from poise.metrics.tracking import MM
+from poise.metrics.tracking_errors import MM
 from poise.motion.roles import SIDES, JointMap
 from poise.motion.rotations import normalize
 

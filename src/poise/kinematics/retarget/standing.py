@@ -17,7 +17,6 @@ from poise.motion.info import sampled
 from poise.motion.roles import SIDES
 from poise.motion.rotations import (
     axis_angle_to_quat,
-    forward_kinematics,
     matrix_to_quat,
     normalize,
     quat_conj,
@@ -41,7 +40,7 @@ def pose_positions(roles: Roles, local: Tensor) -> tuple[Tensor, Tensor]:
     """World positions `(J, 3)` and rotations `(J, 4)` of `local (J, 4)`, the root at the origin."""
     skeleton = roles.skeleton
     zero = torch.zeros(3, dtype=torch.float64)
-    return forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), zero, local)
+    return skeleton.forward(zero, local)
 
 
 def body_axes(roles: Roles, pos: Tensor) -> tuple[Tensor, Tensor]:

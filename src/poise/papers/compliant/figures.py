@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from poise.control import Compliance, Stiffness
-from poise.env.events import ScenePart
-from poise.env.plugins import Felt, Plugin
+from poise.env.events import Event, Felt, Force
+from poise.env.scene import ScenePart
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.jobs.tracker import Tracker
@@ -63,17 +63,18 @@ class Measured:
         return float("nan") if self.fell or self.moved_m <= 0.0 else self.newtons / self.moved_m
 
 
-class _Held(Plugin):
+class _Held(Force):
     """A constant force on one body of each character, while it is on."""
 
     def __init__(self, backend: Backend, body: Tensor, force: Tensor):
         self.backend, self.body, self.force, self.on = backend, body, force, False
         self._every = torch.arange(len(body))
 
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """Adds the force."""
         if self.on:
             drive.xfrc_applied[self._every, self.body, :3] += self.force
+        return False
 
     def felt(self) -> Felt:
         """The force, while it is on."""
@@ -116,15 +117,15 @@ def measure(
     force = torch.tensor([[size * a for a in axis or (0.0,) * 3] for _, _, axis, size in rows]).double()
     held: list[_Held] = []
 
-    def hold(goal: object, backend: Backend) -> Plugin:
+    def hold(goal: object, backend: Backend) -> Event:
         held.append(_Held(backend, body, force))
         return held[0]
 
-    own = replace(task.task, plugins=(hold,), compliance=given, dones=(), help_by="all")
+    own = replace(task.task, events=(hold,), compliance=given, dones=(), help_by="all")
     env = replace(task, task=own).env(
         len(rows), auto_reset=False, threads=threads, help_scale=0.0, guard=False
     )
-    yields = env.plugin(Yielding)
+    yields = env.event(Yielding)
     if yields is not None:
         yields.turn(torch.tensor([k for k, *_ in rows], dtype=torch.float64))
     zero, every = torch.zeros(len(rows), dtype=torch.long), torch.arange(len(rows))
@@ -208,7 +209,7 @@ def throws(
     stage = Throws(speed=(2.0, 3.0), every_s=(WAITS_S, WAITS_S), seed=seed).stage(
         task.humanoid, task.reference
     )
-    own = replace(task.task, plugins=stage.plugins, compliance=given, dones=(), help_by="all")
+    own = replace(task.task, events=stage.events, compliance=given, dones=(), help_by="all")
     task = replace(task, task=own, props=stage.props, touches=stage.touches)
     found = list[tuple[np.ndarray, ...]]()
     for k, level in enumerate(levels):
@@ -224,10 +225,10 @@ def _at(
 ) -> tuple[np.ndarray, ...]:
     """The rows `(M,)` of `Thrown` at one level."""
     env = task.env(count, None, False, threads, help_scale=0.0, guard=False)
-    yields = env.plugin(Yielding)
-    part, goal = env.plugin(ScenePart), env.goal
+    yields = env.event(Yielding)
+    part, goal = env.event(ScenePart), env.goal
     assert yields is not None and part is not None and isinstance(goal, DisplacedGoal)
-    throw = part.happenings[1]
+    throw = part.events[1]
     yields.turn(level)
     zero = torch.zeros(count, dtype=torch.long)
     obs, rate = env.reset_to(zero, zero), task.reference.rate_hz
@@ -242,7 +243,7 @@ def _at(
         if step == last:
             throw.rows()["left"].fill_(10_000)
         obs = env.step(tracker.policy.act(obs)).final_obs
-        sources = part.sources()
+        sources = part.tells()
         force = sources["peak/hit"].double()
         hit |= force > TOUCHES_N
         now = hit & (left > 0)

@@ -160,7 +160,7 @@ def observations(config: CompliantImitation) -> tuple[ObsTerm, ...]:
 
 def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
     """The controller's task as terms."""
-    plugins: tuple[Any, ...] = (Shifted,)
+    events: tuple[Any, ...] = (Shifted,)
     if config.newtons is not None:
         hands = humanoid.rows_of("hand")
         if not hands:
@@ -168,7 +168,7 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
                 "the body has no hands to push", hint="Set newtons=None", code="body-part-missing"
             )
         hz = config.sim.control_hz
-        plugins += (Pushes(config.newtons, (0.5, 1.5), 0.3, hands, hz, config.seed),)
+        events += (Pushes(config.newtons, (0.5, 1.5), 0.3, hands, hz, config.seed),)
     paid = root_place if config.style else posed_place
     root = torch.tensor([0])
     return TaskConfig(
@@ -182,7 +182,7 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
         horizon=config.horizon,
         style=(ObsTerm("posture", posture),) if config.style else (),
         compliance=None if config.level is None else Compliance(config.level),
-        plugins=plugins,
+        events=events,
     )
 
 

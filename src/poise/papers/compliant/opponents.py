@@ -16,11 +16,10 @@ from poise.control import Compliance, Stiffness
 from poise.env import Reference
 from poise.env.controls import steps
 from poise.env.env import ImitationEnv
-from poise.env.events import InScene, touches_of
+from poise.env.events import EpisodeStart, Event
 from poise.env.frame import Frame, Observable
 from poise.env.goal import Goal
-from poise.env.plugins import Plugin
-from poise.env.reference import Start
+from poise.env.scene import InScene, touches_of
 from poise.env.task import Acts, EnvStep
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
@@ -39,8 +38,8 @@ from poise.sim import Backend, Character, CharacterRows, Drive, displaced
 
 @dataclass(frozen=True, eq=False)
 class Opponent:
-    """Given to `TaskConfig.plugins`: a character of the scene that another environment drives, step by
-    step with the one that holds the plug-in.
+    """Given to `TaskConfig.events`: a character of the scene that another environment drives, step by
+    step with the one that holds the event.
 
     Unlike `Teams` it lets one environment be looked at as any other; the other's episodes begin where
     its clip does, with those of all worlds, and never end.
@@ -56,14 +55,14 @@ class Opponent:
     policy: Acts
 
     def __call__(self, goal: Goal, backend: Backend) -> Opposing:
-        """The plug-in of an environment."""
+        """The event of an environment."""
         if not isinstance(backend, CharacterRows) or backend.sim is None or len(backend.places) != 1:
             what = "an opponent needs a scene with one character and itself in each world"
             raise PoiseError(what, f"Opponent '{self.name}'", code="scene-needed")
         return Opposing(self, backend.sim.characters(self.name))
 
 
-class Opposing(Plugin):
+class Opposing(Event):
     """`Opponent` in N worlds.
 
     Attributes:
@@ -76,30 +75,28 @@ class Opposing(Plugin):
         self._obs = self.env.reset_to(self._zero, self._zero)
         self._held: tuple[Tensor, ...] | None = None
 
-    def placed(self, ids: Tensor | None) -> None:
+    def look(self, ids: Tensor | None) -> None:
         """It begins anew where all worlds do."""
         if ids is None or len(ids) == len(self._zero):
             self._obs = self.env.reset_to(self._zero, self._zero)
 
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """Its action for the control step that begins."""
         actuation = self.env.controls.actuation
         self.env.drive(self._policy.act(self._obs))
-        actuation.push()
+        more = actuation.before()
         self._held, self._first = actuation.held(), True
         self._rows.push()
+        return more
 
-    def busy(self) -> bool:
-        return any(p.busy() for p in self.env.controls.actuation.pushing_substeps)
-
-    def push_substep(self, drive: Drive) -> None:
+    def before_substep(self, drive: Drive) -> None:
         if not self._first:
             self._rows.pull()
-        self.env.controls.actuation.push_substep(None if self._first else self._held)
+        self.env.controls.actuation.substep(None if self._first else self._held)
         self._first = False
         self._rows.push()
 
-    def tick(self) -> None:
+    def after_step(self) -> None:
         self._rows.pull()
         self._obs = self.env.renew(self.env.judge()).obs
 
@@ -224,14 +221,14 @@ def weighed(task: Imitation, kg: float, ahead_m: float = 0.0) -> Imitation:
 
 
 def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[SceneSetup, Imitation]:
-    """The stage with the opponent in it, and the opponent's task; its plug-in comes by `opposing`."""
+    """The stage with the opponent in it, and the opponent's task; its event comes by `opposing`."""
     clip = hopping(tracker, yaw=math.pi, ways=AT_SOMEBODY)
     task = weighed(imitation_of(tracker, [place(clip, tracker)]), scene.other, APART_M)
     felt = touches_of("back", "character", task.humanoid.bodies, f"{RIVAL}/")
     task = replace(
         task,
         task=replace(
-            task.task, plugins=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
+            task.task, events=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
         ),
     )
     rival = Character(task.humanoid, RIVAL)
@@ -239,7 +236,7 @@ def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[Sc
 
 
 def opposing(task: Imitation, tracker: Tracker, given: Compliance | Stiffness | None) -> Opponent:
-    """The opponent as a plug-in, which gives way as the player does."""
+    """The opponent as an event, which gives way as the player does."""
     own = replace(task, task=replace(task.task, compliance=given))
 
     def make(rows: Backend) -> ImitationEnv:
@@ -262,8 +259,8 @@ class Undisplaced(NamedTuple):
     before: Tensor
 
 
-class Shifted(Plugin):
-    """Gives terms `frame.shifted`, see `Undisplaced`; given to `TaskConfig.plugins`.
+class Shifted(Event):
+    """Gives terms `frame.shifted`, see `Undisplaced`; given to `TaskConfig.events`.
 
     The displacement is taken back in the coordinates in which it was added (`sim.displaced`): hinge by
     hinge, where the logarithm of a joint's turn is the difference of its angles, and of the root.
@@ -281,39 +278,25 @@ class Shifted(Plugin):
         self._u = goal.offset if isinstance(goal, DisplacedGoal) else nothing
         self.before = torch.zeros(n, len(table.rows), 3, device=here)
 
-    @property
-    def observables(self) -> Mapping[str, Observable]:
-        return {"shifted": self._shifted}
+    def tells(self) -> Mapping[str, Tensor | Observable]:
+        return {"shifted": self._shifted, "shifted/u": self._u, "shifted/before": self.before}
 
-    def sources(self) -> Mapping[str, Tensor]:
-        return {"shifted/u": self._u, "shifted/before": self.before}
+    def begin(self, episodes: EpisodeStart) -> None:
+        body = self._kinematics(*(x.float() for x in episodes.start))
+        self.before[episodes.rows] = body.pos - body.linvel / self._rate
 
-    def start(
-        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
-    ) -> Start:
-        body = self._kinematics(*(x.float() for x in start))
-        rows = slice(None) if ids is None else ids
-        self.before[rows] = body.pos - body.linvel / self._rate
-        return start
-
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """A control step begins."""
         state = self._backend.state
-        if not bool(self._u.any()):
+        if bool(self._u.any()):
+            undone = displaced(state.qpos.double(), -self._u).float()
+            self.before.copy_(self._kinematics(undone).pos)
+        else:
             self.before.copy_(state.xpos[:, 1:])
-            return
-        self.before.copy_(self._kinematics(displaced(state.qpos.double(), -self._u).float()).pos)
+        return False
 
     def rows(self) -> dict[str, Tensor]:
         return {"shifted/before": self.before}
-
-    def state(self) -> dict[str, Tensor]:
-        return {"shifted/before": self.before.clone()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on from where the bodies were; from a task that did not know with what is known here."""
-        if "shifted/before" in state:
-            self.before.copy_(state["shifted/before"])
 
     def _shifted(self, frame: Frame) -> Undisplaced:
         qpos = displaced(frame.source("qpos").double(), -frame.source("shifted/u")).float()

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.events import ScenePart
-from poise.env.plugins import Felt, Plugin
+from poise.env.events import Felt, Force
+from poise.env.scene import ScenePart
 from poise.env.yielding import DisplacedGoal
 from poise.jobs.track.controllers import RULE
 from poise.kinematics import lowest_height
@@ -53,7 +53,7 @@ class Meter(Protocol):
 
 def part_of(env: ImitationEnv) -> ScenePart:
     """An environment's part in its scene."""
-    part = env.plugin(ScenePart)
+    part = env.event(ScenePart)
     assert part is not None
     return part
 
@@ -78,12 +78,12 @@ class Watch:
         self.meter = meter
         self.arrows: list[np.ndarray] = []
         self._ways: list[np.ndarray] = []
-        self._felt: list[Plugin] = []
+        self._felt: list[Force] = []
 
     def begin(self, env: ImitationEnv) -> None:
         """Looks at an environment from now on."""
         n = env.num_envs
-        self._felt = [p for p in env.plugins if type(p).felt is not Plugin.felt]
+        self._felt = [event for event in env.events if isinstance(event, Force)]
         self._step_s = env.substeps * float(env.backend.model.opt.timestep)
         names = ("impulse", "sum", "peak", "acts", "torque", "steps", "moved")
         self._sums = {k: torch.zeros(n, dtype=torch.float64) for k in names}
@@ -110,11 +110,11 @@ class Watch:
         """Keeps control step `step`; it never needs more of them."""
         felt = [f for f in (p.felt() for p in self._felt) if f is not None]
         force = torch.stack([f.force.norm(dim=-1).sum(1) for f in felt]).sum(0).double()
-        peak, metered = force, env.plugin(ScenePart)
-        if metered is not None and "peak/hit" in metered.sources():
+        peak, metered = force, env.event(ScenePart)
+        if metered is not None and "peak/hit" in metered.tells():
             # Physics step by physics step, where it is metered.
-            peak = metered.sources()["peak/hit"].double()
-            force = metered.sources()["impulse/hit"].double().norm(dim=-1) / self._step_s
+            peak = metered.tells()["peak/hit"].double()
+            force = metered.tells()["impulse/hit"].double().norm(dim=-1) / self._step_s
         if self.meter is not None:
             self.meter.see(env, step)
         s = self._sums
@@ -238,7 +238,7 @@ class TrampolineMeter:
 
     def begin(self, env: ImitationEnv) -> None:
         part = part_of(env)
-        self._bounce = next(h for h in part.happenings if isinstance(h, Bouncing))
+        self._bounce = next(h for h in part.events if isinstance(h, Bouncing))
         self._sim, self._mechanics = part.sim, Mechanics(env.backend)
         self._feet = list(env.goal.humanoid.feet)
         n = env.num_envs
@@ -320,7 +320,7 @@ class ChickenMeter:
 
     def begin(self, env: ImitationEnv) -> None:
         self._part = part_of(env)
-        opposing = env.plugin(Opposing)
+        opposing = env.event(Opposing)
         self._envs = [env] if opposing is None else [env, opposing.env]
         n = env.num_envs
         self._left = torch.full((n,), -1, dtype=torch.long)

@@ -141,12 +141,12 @@ class StagedPerpetual(Perpetual):
 
 #: The settings of one network on all clips.
 ONE_NETWORK = {"single": True, "multiplicative": True, "progressive": True, "trajopt": None}
-#: What a policy that goes on keeps besides what `jobs.perpetual.run.KEPT` names.
+#: What a policy that goes on keeps besides what `jobs.perpetual.perpetual_run.KEPT` names.
 KEPT = STAGED - {"shares"}
 
 
 def going_on(policy: Perpetual, wanted: StagedPerpetual, returns: bool = False) -> StagedPerpetual:
-    """The settings of a run that goes on from a policy, see `jobs.perpetual.run.going_on`.
+    """The settings of a run that goes on from a policy, see `jobs.perpetual.perpetual_run.going_on`.
 
     Where recovery is learned, the policy stays as it is, the first primitive of more, unless one network
     is to learn both.
@@ -157,9 +157,9 @@ def going_on(policy: Perpetual, wanted: StagedPerpetual, returns: bool = False) 
     Raises:
         PoiseError: the policy is made of primitives.
     """
-    from poise.jobs.perpetual import run
+    from poise.jobs.perpetual import perpetual_run
 
-    config = StagedPerpetual.of(run.going_on(policy, wanted), trajopt=None)
+    config = StagedPerpetual.of(perpetual_run.going_on(policy, wanted), trajopt=None)
     if not wanted.recovery or wanted.single:
         return config
     changes: dict[str, Any] = {"single": False, "multiplicative": True, "progressive": True}

@@ -324,7 +324,7 @@ class Owners:
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for raw observations `(N, O)` of the worlds as they stand."""
         actions = self.primitives.all(self.norm.forward(obs))
-        owner, clock = self.owner[self.env.clip], self.env.plugin(RecoveryClock)
+        owner, clock = self.owner[self.env.clip], self.env.event(RecoveryClock)
         if clock is not None:
             far = clock.before > clock.config.switch
             owner = torch.where(far, self.recovers, owner)

@@ -6,7 +6,7 @@ humanoid, stage III lets a policy imitate it with a residual force that becomes 
 | paper                                        | here                                               |
 |----------------------------------------------|----------------------------------------------------|
 | Sec. 3.1 in-betweening (Harvey et al.)       | `jobs.inbetween`, `rtn`, `learn.between`           |
-| Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.inbetween`                                  |
+| Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.inbetween_model`                            |
 | Sec. 3.3, App. A analytic IK                 | `kinematics.ik`, for joints alone; `build`         |
 |                                              | takes a clip's own angles and sets it on the floor |
 | Sec. 3.4.1 state with the next two frames    | `env.observations`, `observation="next two"`       |

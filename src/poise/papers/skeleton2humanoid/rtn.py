@@ -22,7 +22,7 @@ from poise.learn.transition import (
     out_of_place,
     place_of,
 )
-from poise.learn.windows import Sampler, Windows
+from poise.learn.window_sampler import Sampler, Windows
 from poise.motion.rotations import normalize
 from poise.settings import Checked, Count, Range
 
@@ -296,7 +296,7 @@ class Scales(torch.nn.Module):
 
 
 class RTNObjective:
-    """Loss and update of an `RTN` and its two critics; see `learn.inbetween.InbetweenTrainer`."""
+    """Loss and update of an `RTN` and its two critics; see `learn.inbetween_model.InbetweenTrainer`."""
 
     def __init__(
         self, net: RTN, config: RTNTraining, std: Tensor, steps: int, generator: torch.Generator

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from poise.score.card import THRESHOLDS
 from poise.score.report.data import number
+from poise.score.thresholds import THRESHOLDS
 
 LEVELS = ("good", "fair", "poor")
 

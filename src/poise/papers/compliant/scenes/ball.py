@@ -8,25 +8,25 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+import mujoco
 import torch
 from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, RandomEvent
+from poise.env.events import EpisodeStart, Event, Felt, Force
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
-from poise.env.plugins import Felt, Plugin
 from poise.env.pushes import Pushes
 from poise.env.reference import Reference
-from poise.env.things import Switch, near
+from poise.env.scene import InScene, RandomEvent, Switch, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
 from poise.papers.compliant.scenes.stage import Given, SceneSetup
-from poise.settings import Range, validate
+from poise.settings import Checked, Positive, Range, validate
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
-from poise.sim.props import Rod
+from poise.sim.props import Vector, solid
 
 #: Sharpness of the reward, 1/m^2 (Sec. 5.4).
 SHARPNESS = 2.0
@@ -41,6 +41,39 @@ GAIN, DAMPING = 700.0, 250.0
 #: Of the angle at which a rod counts as fallen.
 COS_45 = math.cos(math.pi / 4)
 FLAT = torch.tensor([1.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Rod(Checked):
+    """A free rod that stands on its lower end and carries a ball on the upper one; one body, with the
+    lower end as its origin. Nothing touches it, so that what it stands on must be a link.
+
+    Attributes:
+        name: how the scene calls it.
+        length: m, from the lower end to the ball's centre.
+        radius: m, of the ball.
+        mass: kg, of the ball; the rod has a tenth of it.
+        pos: m, its lower end at first.
+    """
+
+    name: str = "rod"
+    length: Positive = 1.0
+    radius: Positive = 0.08
+    mass: Positive = 0.5
+    pos: Vector = (0.0, 0.0, 0.0)
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body."""
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
+        body.add_freejoint(name=self.name)
+        rod, ball = [0.0, 0.0, self.length / 2], [0.0, 0.0, self.length]
+        thin = [0.015, self.length / 2]
+        geoms = (
+            solid(body, f"{self.name}/rod", "capsule", thin, pos=rod, mass=0.1 * self.mass),
+            solid(body, f"{self.name}/ball", "sphere", [self.radius], pos=ball, mass=self.mass),
+        )
+        for geom in geoms:
+            geom.contype = geom.conaffinity = 0
 
 
 @dataclass(frozen=True)
@@ -144,7 +177,8 @@ class _Tilted(RandomEvent):
         super().__init__(event.seed)
         self._event, self._sim = event, sim
 
-    def begin(self, worlds: Tensor) -> None:
+    def begin(self, episodes: EpisodeStart) -> None:
+        worlds = episodes.worlds
         half = 0.5 * self.between(-self._event.spread, self._event.spread, len(worlds), 2)
         qpos = torch.zeros(len(worlds), 7, dtype=torch.float64)
         qpos[:, :3], qpos[:, 3] = torch.tensor(self._event.rod.pos), 1.0
@@ -157,7 +191,7 @@ class _Tilted(RandomEvent):
 
 @dataclass(frozen=True)
 class Fictional:
-    """The fictional forces of `Balance`, as a plug-in.
+    """The fictional forces of `Balance`, as an event.
 
     Attributes:
         given: the scene.
@@ -167,14 +201,14 @@ class Fictional:
     given: Balance
     head: int
 
-    def __call__(self, goal: Goal, backend: Backend) -> Plugin:
-        """The plug-in of an environment."""
+    def __call__(self, goal: Goal, backend: Backend) -> Event:
+        """The event of an environment."""
         if not isinstance(backend, CharacterRows) or backend.sim is None:
             raise PoiseError("'ball' needs the worlds of its scene", "ball", code="scene-needed")
         return FictionalForces(self, backend, backend.sim, goal)
 
 
-class FictionalForces(Plugin):
+class FictionalForces(Force):
     """The fictional forces in N worlds.
 
     Attributes:
@@ -189,10 +223,7 @@ class FictionalForces(Plugin):
         self._body = torch.tensor([given.head + 1, 1], device=like.device).repeat(rows.num_envs, 1)
         self._force = like.new_zeros(rows.num_envs, 2, 3)
 
-    def follow(self, goal: Goal) -> None:
-        self._goal = goal
-
-    def push(self, drive: Drive) -> None:
+    def before_step(self, drive: Drive) -> bool:
         """A control step begins: sets the forces that are held for it."""
         law = self._given.given
         off, moves = tipped(self._sim, law.length)
@@ -207,6 +238,7 @@ class FictionalForces(Plugin):
             force = force + quat_rotate(heading.to(local).expand(-1, 2, -1), local)
         size = force.norm(dim=-1, keepdim=True)
         self._force = force * (MOST_N / size.clamp_min(MOST_N))
+        return False
 
     def _head(self) -> Tensor:
         """`(N, 3)` where the head would be without giving way, m."""

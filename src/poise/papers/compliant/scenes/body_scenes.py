@@ -9,22 +9,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.env.events import Happening, InScene, ScenePart, touches_of
+from poise.env.events import EpisodeStart, Event
 from poise.env.pushes import Push
 from poise.env.reference import Reference
-from poise.env.things import Move, SetDown, Switch, Throw, always
+from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
 from poise.errors import PoiseError
 from poise.papers.compliant.scenes.stage import Given, SceneSetup, as_given, hand_of
-from poise.settings import Range, validate
-from poise.sim import Link, Plane, SceneSim, Touch
-from poise.sim.props import Ball, Box, Carrier
-from poise.sim.props import Trampoline as Plate
+from poise.settings import Checked, Positive, Range, validate
+from poise.sim import Drive, Link, Plane, SceneSim, Touch
+from poise.sim.props import Ball, Box, Carrier, Vector, solid
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class PullScene:
         x, y, z = (float(self.newtons * v) for v in unit)
         rate = reference.rate_hz
         steps = max(1, round(self.lasts_s * rate))
-        return SceneSetup(plugins=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
+        return SceneSetup(events=(Push(row, (x, y, z), round(self.start_s * rate), steps),))
 
 
 @dataclass(frozen=True)
@@ -221,6 +221,59 @@ BELOW_M = -1.0
 
 
 @dataclass(frozen=True)
+class Trampoline(Checked):
+    """A plate that a spring and a damper at each corner hold at a height that is its control.
+
+    It has three coordinates, the height above `pos`, m, and its tilts about X and Y, rad, and four
+    controls, the heights wanted of the corners. Its own weight is carried.
+
+    Attributes:
+        name: how the scene calls it.
+        size: `(x, y)` m.
+        pos: m, the middle of its upper face at rest.
+        mass: kg.
+        stiffness: N/m, of each corner.
+        damping: N s/m, of each corner.
+    """
+
+    name: str = "trampoline"
+    size: Annotated[tuple[float, float], Range(0, above=True)] = (2.4, 2.4)
+    pos: Vector = (0.0, 0.0, 0.0)
+    mass: Positive = 20.0
+    stiffness: Positive = 4000.0
+    damping: Positive = 120.0
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Adds one body on a slide and two hinges, and its actuators "NAME/0" to "NAME/3"."""
+        half, (x, y) = 0.02, self.size
+        body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), gravcomp=1.0)
+        for kind, name, axis in (("SLIDE", "z", 2), ("HINGE", "x", 0), ("HINGE", "y", 1)):
+            along = [float(i == axis) for i in range(3)]
+            joint = getattr(mujoco.mjtJoint, f"mjJNT_{kind}")
+            body.add_joint(name=f"{self.name}/{name}", type=joint, axis=along)
+        solid(body, self.name, "box", [x / 2, y / 2, half], pos=[0.0, 0.0, -half], mass=self.mass)
+        for k, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+            name, corner = f"{self.name}/{k}", [sx * x / 2, sy * y / 2, 0.0]
+            body.add_site(name=name, pos=corner)
+            foot = [a + b for a, b in zip(self.pos, corner, strict=True)]
+            spec.worldbody.add_site(name=f"{name}/foot", pos=foot)
+            servo = spec.add_actuator(
+                name=name,
+                target=name,
+                refsite=f"{name}/foot",
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                gear=[0, 0, 1, 0, 0, 0],
+            )
+            servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = (
+                self.stiffness,
+                -self.stiffness,
+                -self.damping,
+            )
+
+
+@dataclass(frozen=True)
 class TrampolineScene:
     """A rigid plate on four linear actuators, which throws the character up every 3 s.
 
@@ -242,7 +295,7 @@ class TrampolineScene:
         # In the middle of what the motion crosses.
         low, high = torch.aminmax(reference.pose.pos[:, 0, :2], dim=0)
         x, y = (0.5 * (low + high)).tolist()
-        plate = Plate(pos=(x, y, 0.0))
+        plate = Trampoline(pos=(x, y, 0.0))
         feet = tuple(humanoid.bodies[i] for i in humanoid.feet)
         touches = touches_of("felt", plate.name, feet)
         names = tuple(t.name for t in touches)
@@ -262,7 +315,7 @@ def stands_still(given: Given | None) -> Given:
 
 def after_contact(part: ScenePart, force: Tensor) -> Tensor:
     """A force where the character gives way just now, else 0."""
-    bounce = next(h for h in part.happenings if isinstance(h, Bouncing))
+    bounce = next(h for h in part.events if isinstance(h, Bouncing))
     return force * (bounce.gives > 0).to(force).unsqueeze(1)
 
 
@@ -282,12 +335,12 @@ class Bounce:
     touches: tuple[str, ...]
     first: float = 1.0
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
+    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
         """The event in the worlds of a scene."""
         return Bouncing(self, sim, control_hz)
 
 
-class Bouncing(Happening):
+class Bouncing(Event):
     """`Bounce` in N worlds.
 
     Attributes:
@@ -308,17 +361,19 @@ class Bouncing(Happening):
     def rows(self) -> dict[str, Tensor]:
         return {"steps": self.steps, "gives": self.gives, "air": self.air}
 
-    def begin(self, worlds: Tensor) -> None:
+    def begin(self, episodes: EpisodeStart) -> None:
+        worlds = episodes.worlds
         for value in (self.steps, self.gives, self.air):
             value[worlds] = 0
 
-    def before(self) -> None:
+    def before_step(self, drive: Drive) -> bool:
         since = self.steps / self._hz - self._event.first
         up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
-        drive = self._sim.backend.drive.ctrl
-        drive[:, self._controls] = self._event.height * up.to(drive).unsqueeze(1)
+        ctrl = self._sim.backend.drive.ctrl
+        ctrl[:, self._controls] = self._event.height * up.to(ctrl).unsqueeze(1)
+        return False
 
-    def after(self) -> None:
+    def after_step(self) -> None:
         self.steps += 1
         force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self._event.touches)
         stands = torch.as_tensor(force) > CONTACT_N

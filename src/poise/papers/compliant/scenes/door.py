@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.events import Happening, InScene, ScenePart
+from poise.env.events import EpisodeStart, Event
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
-from poise.env.things import SetDown
+from poise.env.scene import InScene, ScenePart, SetDown
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
 from poise.papers.compliant.scenes.stage import SceneSetup, hand_of
 from poise.settings import Range, validate
-from poise.sim import Link, SceneSim
+from poise.sim import Drive, Link, SceneSim
 from poise.sim.props import Door
 
 #: s of the motion: the hand is at the knob, lets go of it, and the motion ends; how wide it opens, rad.
@@ -168,12 +168,12 @@ class Grip:
     hand: str
     door: Door
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
+    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
         """The event in the worlds of a scene."""
         return _Grip(self, sim, control_hz)
 
 
-class _Grip(Happening):
+class _Grip(Event):
     def __init__(self, event: Grip, sim: SceneSim, control_hz: float):
         self._sim, self._hz = sim, control_hz
         self._hand, self._knob = sim.scene.model.body(event.hand).id, torch.tensor(event.door.knob)
@@ -184,11 +184,12 @@ class _Grip(Happening):
     def rows(self) -> dict[str, Tensor]:
         return {"steps": self.steps}
 
-    def begin(self, worlds: Tensor) -> None:
+    def begin(self, episodes: EpisodeStart) -> None:
+        worlds = episodes.worlds
         self.steps[worlds] = 0
         self._sim.switch("grip", False, worlds)
 
-    def before(self) -> None:
+    def before_step(self, drive: Drive) -> bool:
         state, seconds = self._sim.backend.state, self.steps / self._hz
         on = state["eq_active"][:, self._row].bool()
         if len(rows := (on & (seconds >= LETS_GO_S)).nonzero().squeeze(-1)):
@@ -199,6 +200,7 @@ class _Grip(Happening):
         close = (state.xpos[:, self._hand] - knob).norm(dim=-1) < NEAR_M
         if len(rows := (due & close).nonzero().squeeze(-1)):
             self._sim.switch("grip", True, rows)
+        return False
 
-    def after(self) -> None:
+    def after_step(self) -> None:
         self.steps += 1

@@ -7,9 +7,9 @@ from typing import NamedTuple, Protocol
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
+from poise.env.events import Event
 from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
 from poise.env.goal import Goal
-from poise.env.plugins import Plugin
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.sim import Backend, Character, Floor, Link, Plane, Touch
@@ -28,7 +28,7 @@ class SceneSetup(NamedTuple):
 
     Attributes:
         props, links, touches: see `sim.Scene`; the character's bodies have their own names.
-        plugins: of the task; those that tell forces (`Plugin.felt`) are what the character gives way to.
+        events: of the task; those that tell forces (`Event.felt`) are what the character gives way to.
         floor: what they stand on.
         obs, rewards, dones: of a policy that learns the scene: the task's state, reward and failure.
         yields: how a character gives way in the scene, of what is stated, None for nothing.
@@ -38,7 +38,7 @@ class SceneSetup(NamedTuple):
     props: tuple[Prop | Character, ...] = ()
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
-    plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
+    events: tuple[Callable[[Goal, Backend], Event], ...] = ()
     obs: tuple[ObsTerm, ...] = ()
     rewards: tuple[RewardTerm, ...] = ()
     dones: tuple[DoneTerm, ...] = ()

@@ -4,7 +4,7 @@ PHC (Luo et al. 2023, Sec. 3.1) tells its policy the SMPL shape beta; here `phc_
 lengths and masses, and training goes over S bodies. The first is the library's own. In the others each
 part has another size, drawn per group of `GROUPS` and alike on both sides: its length and its girth are
 scaled together, so that its mass goes with the cube at equal density. Strength follows mass and height
-as everywhere (`body.table.Strength`).
+as everywhere (`body.body_table.Strength`).
 
 Every clip is retargeted onto the bodies that do it, so that feet stand where they stood, and counts as a
 clip of its own, "walk@3" on body 3: episodes, hard negatives and evaluations need know nothing of it. A
@@ -24,7 +24,7 @@ import numpy as np
 from torch import Tensor
 
 from poise.body import BodyTable, Humanoid, make_humanoid
-from poise.body.table import BodyRow, Geom, Strength
+from poise.body.body_table import BodyRow, Geom, Strength
 from poise.env import Reference, TaskConfig
 from poise.env import observations as obs
 from poise.errors import PoiseError

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
-from poise.metrics.shapes import Shapes, geom_heights
+from poise.metrics.shape_points import Shapes, geom_heights
 from poise.motion.rotations import best_rotation
 
 MM = 1000.0

@@ -18,7 +18,7 @@ import torch
 from poise.errors import PoiseError
 from poise.formats.own import pack_clips
 from poise.formats.table import READERS
-from poise.jobs.inbetween.settings import Contacts, Inbetween
+from poise.jobs.inbetween.inbetween_settings import Contacts, Inbetween
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.folder import library_of
 from poise.kinematics.feet import standing_labels
@@ -31,7 +31,7 @@ from poise.learn.checkpoint import (
     prefixed,
     save_checkpoint,
 )
-from poise.learn.inbetween import (
+from poise.learn.inbetween_model import (
     MODEL,
     BlockStats,
     InbetweenModel,
@@ -42,7 +42,7 @@ from poise.learn.inbetween import (
     train_inbetween,
 )
 from poise.learn.transition import SkeletonLayout
-from poise.learn.windows import FrameData, Sampler
+from poise.learn.window_sampler import FrameData, Sampler
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import normalize
 from poise.motion.windows import (

@@ -1,4 +1,4 @@
-"""The settings of an in-betweening network's training, see `jobs.inbetween.training`."""
+"""The settings of an in-betweening network's training, see `jobs.inbetween.inbetween_training`."""
 
 from __future__ import annotations
 

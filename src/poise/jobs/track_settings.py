@@ -36,7 +36,7 @@ class TrackConfig:
         seed: seed of the noise, and of what lookahead and search draw.
         reset_on_fail: put a character that is 0.5 m off back onto the motion, and go on.
         recover: a character that is 0.5 m off gets up, walks back and goes on where the motion waits for
-            it, see `env.recovery`.
+            it.
         smooth_hz: cut-off of a low-pass on keypoints.
         count: characters that do the motion side by side in one world, where they may collide.
         controller: policy acts alone, at once; lookahead tries in copies of the character before it
@@ -79,11 +79,11 @@ class TrackConfig:
 
     def __post_init__(self) -> None:
         validate(self)
-        for rule in RULES:
-            other = next((r for r in RULES if r.name in rule.alone and r.asked(self)), None)
-            if other is not None and rule.asked(self):
+        for name in self._asked:
+            other = next((n for n in RULES[name][1] if n in self._asked), None)
+            if other is not None:
                 raise PoiseError(
-                    f"{rule.subject} for a single character that tracks, not {other.called}",
+                    f"{name} is for a single character that tracks, and cannot go with {other}",
                     code="single-character-only",
                 )
         if self.body == "own" and self.recover:
@@ -100,11 +100,16 @@ class TrackConfig:
         """
         if not clips:
             raise PoiseError("there is no clip to track", code="no-clips")
-        rule = next((r for r in RULES if r.single and r.asked(self)), None)
-        if clips > 1 and rule is not None:
+        alone = [name for name in self._asked if name != _COMES]
+        if clips > 1 and alone:
             raise PoiseError(
-                f"{rule.subject} for a single clip, and {clips} were given", code="single-clip-only"
+                f"only a single clip can have {alone[0]}, and {clips} were given",
+                code="single-clip-only",
             )
+
+    @property
+    def _asked(self) -> list[str]:
+        return [name for name, (asked, _) in RULES.items() if asked(self)]
 
     @property
     def looks_ahead(self) -> bool:
@@ -118,80 +123,18 @@ class TrackConfig:
         return self.controller == "search" or (self.controller == "auto" and single)
 
 
-@dataclass(frozen=True)
-class Rule:
-    """What a feature of tracking is not combined with.
-
-    Attributes:
-        name: of the feature.
-        asked: whether settings ask for it.
-        subject: what begins a sentence about it: "a push is".
-        called: what ends a sentence of another one: "a motion with noise".
-        alone: features that it is not combined with.
-        single: whether it is for a single clip.
-    """
-
-    name: str
-    asked: Callable[[TrackConfig], bool]
-    subject: str
-    called: str
-    alone: tuple[str, ...] = ()
-    single: bool = True
-
-
-_OTHERS = ("recover", "reset", "count")
-#: What cannot be combined, each feature once; the first that meets another one is told.
-RULES = (
-    Rule("count", lambda c: c.count > 1, "several characters are", "several characters"),
-    Rule("noise", lambda c: bool(c.noise), "noise is", "a motion with noise"),
-    Rule(
-        "reset",
-        lambda c: c.reset_on_fail,
-        "putting a character back is",
-        "one that is put back onto the motion",
-    ),
-    Rule(
-        "recover",
-        lambda c: c.recover,
-        "coming back is",
-        "one that comes back by itself",
-        ("count", "reset"),
-        single=False,
-    ),
-    Rule(
-        "search",
-        lambda c: c.controller == "search",
-        "a search is",
-        "a search, which looks for the whole motion",
-        _OTHERS,
-    ),
-    Rule("body", lambda c: c.body == "own", "a body of its own is", "a body of its own"),
-    Rule(
-        "direction",
-        lambda c: bool(c.direction),
-        "weights, pins and touches are",
-        "one that is directed",
-        ("recover", "count"),
-    ),
-    Rule(
-        "retake",
-        lambda c: c.retake is not None,
-        "a range is",
-        "a part that is simulated anew",
-        (*_OTHERS, "noise", "search"),
-    ),
-    Rule(
-        "push",
-        lambda c: c.push is not None,
-        "a push is",
-        "one that is pushed",
-        (*_OTHERS, "noise", "retake", "search"),
-    ),
-    Rule(
-        "supports",
-        lambda c: isinstance(c.supports, tuple),
-        "a support is",
-        "one with supports",
-        ("recover", "count"),
-    ),
-)
+#: Features by their names, where each is asked for, and the ones that it is not combined with; all but
+#: coming back are for a single clip.
+_BACK, _COMES, _MANY = "putting a character back", "coming back by itself", "several characters"
+RULES: dict[str, tuple[Callable[[TrackConfig], bool], tuple[str, ...]]] = {
+    _MANY: (lambda c: c.count > 1, ()),
+    "noise": (lambda c: bool(c.noise), ()),
+    _BACK: (lambda c: c.reset_on_fail, ()),
+    _COMES: (lambda c: c.recover, (_MANY, _BACK)),
+    "a search": (lambda c: c.controller == "search", (_COMES, _BACK, _MANY)),
+    "a body of its own": (lambda c: c.body == "own", ()),
+    "weights, pins and touches": (lambda c: bool(c.direction), (_COMES, _MANY)),
+    "a range": (lambda c: c.retake is not None, (_COMES, _BACK, _MANY, "noise", "a search")),
+    "a push": (lambda c: c.push is not None, (_COMES, _BACK, _MANY, "noise", "a range", "a search")),
+    "a support": (lambda c: isinstance(c.supports, tuple), (_COMES, _MANY)),
+}

@@ -26,7 +26,7 @@ from poise.jobs.endless.model import (
     spread,
 )
 from poise.jobs.library.clips import LibraryConfig
-from poise.jobs.perpetual.run import clips_of
+from poise.jobs.perpetual.perpetual_run import clips_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.kinematics.forward import Kinematics
@@ -40,7 +40,7 @@ from poise.learn.cvae import (
     PackedFrames,
     make_cvae,
 )
-from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
+from poise.learn.inbetween_model import BlockStats, InbetweenTrainer, train_inbetween
 from poise.motion import ClipLibrary
 from poise.settings import Checked, Share, from_data, to_data
 from poise.synthesis.generator import ROOT, Codes, coordinates, features_of

@@ -32,8 +32,8 @@ from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.opponents import opposing, rival_stage, weighed
+from poise.papers.compliant.scene_training import LearnedOnTop, Topped, seen
 from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
-from poise.papers.compliant.training import LearnedOnTop, Topped, seen
 from poise.papers.compliant.watch import Watch, meter_of, words_of
 from poise.plan import LookaheadConfig
 from poise.recipes.imitation import Imitation
@@ -184,8 +184,8 @@ def play(
         given = learned.config.given()
     for compliance in (stage.yields(given), None):
         others = () if rival is None else (opposing(rival, tracker, compliance),)
-        plugins = (*stage.plugins, *others)
-        own = replace(task.task, plugins=plugins, compliance=compliance, help_by="all")
+        events = (*stage.events, *others)
+        own = replace(task.task, events=events, compliance=compliance, help_by="all")
         top = None if compliance is None else learned
         if top is not None:
             own = replace(own, obs=(*own.obs, *seen(stage)))

@@ -70,7 +70,7 @@ class Added:
         """The environment's actions `(N, A)`: those of the policy below and what is added to them."""
         joints = env.hinges if self.reach else 0
         if self.forces:
-            forces = env.plugin(FictionalForces)
+            forces = env.event(FictionalForces)
             assert forces is not None
             forces.asked = own[:, joints:].clone()
         if not joints:
@@ -243,7 +243,7 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
         obs=(*base.obs, *seen(stage)),
         rewards=(*imitation, *own),
         dones=dones,
-        plugins=stage.plugins,
+        events=stage.events,
         compliance=stage.yields(config.given()),
         help_by="all",
         style=(),
