@@ -60,7 +60,7 @@ def cost(tracker: Tracker, many: int, steps: int, repeats: int) -> dict[str, Any
     push = Pushes((20.0, 20.0), (0.03, 0.03), 100.0, task.humanoid.rows_of("hand"))
     envs = {}
     for name, given in (("without", None), ("eq8", Compliance()), ("stiffness", Stiffness())):
-        own = replace(task.task, plugins=(push,), compliance=given, dones=(), help_by="all")
+        own = replace(task.task, events=(push,), compliance=given, dones=(), help_by="all")
         envs[name] = replace(task, task=own).env(
             many, auto_reset=False, threads=1, help_scale=0.0, guard=False
         )
