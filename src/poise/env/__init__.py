@@ -1,4 +1,4 @@
-"""Environments: imitation as a list of terms over many simulated worlds."""
+"""Worlds that a policy acts in: goals, observations, rewards, ends, events, recovery."""
 
 from poise.env.env import ImitationEnv
 from poise.env.faces import GymEnv, GymVectorEnv

@@ -1,1 +1,1 @@
-"""Jobs: what a verb does from file to file, and the run folders."""
+"""Each verb from file to file: track, imitate, train, complete, dream; run folders and results."""

@@ -1,4 +1,4 @@
-"""Kinematics of a humanoid: clips cleaned and healed, to generalized coordinates and back, ground."""
+"""Poses without forces: forward and inverse kinematics, feet and floor, retargeting, repair."""
 
 from poise.kinematics.coords import chain_angles, chain_quat, clip_to_qpos, qpos_to_clip, qpos_velocity
 from poise.kinematics.feet import contact_labels, level_feet

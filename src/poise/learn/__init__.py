@@ -1,4 +1,7 @@
-"""Reinforcement learning on any `VecEnv`; it knows neither the simulator nor the character."""
+"""Networks and their training: PPO on any `VecEnv`, clones, a motion prior, networks between keyframes.
+
+It knows neither the simulator nor the character.
+"""
 
 from poise.learn.amp import Amp, AmpConfig
 from poise.learn.checkpoint import LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint

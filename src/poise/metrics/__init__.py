@@ -1,4 +1,7 @@
-"""Pure functions that score motion: tracking, plausibility, help; definitions in docs/results.md."""
+"""Pure functions of positions: tracking errors, sliding and sinking, errors of filled gaps.
+
+Their definitions stand in docs/results.md.
+"""
 
 from poise.metrics.gap_errors import l2p, l2q, npss, physics
 from poise.metrics.plausibility import (

@@ -1,4 +1,4 @@
-"""Motion data: skeletons, frozen clips, libraries of clips."""
+"""Skeletons, frozen clips and their libraries, keypoints, rotations, noise and its measure."""
 
 from poise.motion.clip import Clip, ClipLibrary, ground_shift, resample, shifted, trim
 from poise.motion.info import describe, standing_height

@@ -1,5 +1,4 @@
-"""Four papers, each a short package over the engine: what only its tables and its own scenes need.
+"""What only the tables and scenes of four papers need; no other package but `cli` imports it.
 
-The engine never imports them; the command line may. The engine holds whatever has a verb for any
-motion, and whatever ships.
+The engine holds whatever has a verb for any motion, and whatever ships.
 """

@@ -1,6 +1,6 @@
-"""Recipes: each paper as one short file over shared parts.
+"""Tasks and their settings: one clip with help that fades, one policy for a library of clips.
 
-Their settings are imported without torch, which the recipes themselves need.
+The settings are imported without torch, which the tasks themselves need.
 """
 
 from __future__ import annotations

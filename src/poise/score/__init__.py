@@ -1,4 +1,4 @@
-"""Evaluation: padded rollouts in, a score card with stable keys out."""
+"""Episodes of a policy in, a score card with stable keys and a report out."""
 
 from poise.score.card import CardRow, Help, ScoreCard, read_score, table, write_score
 from poise.score.episodes import (
