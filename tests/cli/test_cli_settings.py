@@ -160,6 +160,7 @@ def test_settings_of_another_recipe_are_refused() -> None:
     for name, what in (
         ("ppo.polcy_lr=1", ("unknown-setting", "policy_lr")),
         ("ppo.gamma=high", ("wrong-type", "high")),
+        ("horizn=99", ("unknown-setting", "horizon")),
     ):
         with refused(*what):
             imitates("--set", name)

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import NoneType, SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from poise.errors import PoiseError
+from poise.errors import PoiseError, did_you_mean
 from poise.settings import imported
 
 if TYPE_CHECKING:
@@ -104,12 +104,20 @@ def given(*groups: Any) -> dict[str, Any]:
 
 
 def stated(texts: tuple[str, ...], kind: type) -> tuple[dict[str, Any], list[str]]:
-    """Settings of `kind` among NAME=VALUE texts such as ppo.policy_lr=1e-4, and the other texts."""
+    """Settings of `kind` among NAME=VALUE texts such as ppo.policy_lr=1e-4, and the other texts, which are
+    of a body (lfoot.kp=400).
+
+    Raises:
+        PoiseError: a name without a dot that is neither.
+    """
     known, out, other = {f.name for f in fields(kind)}, {}, []
     for text in texts:
         name, equals, value = text.partition("=")
         name = name.strip().replace("-", "_")
         if not equals or name.partition(".")[0] not in known:
+            if equals and "." not in name and name != "friction":
+                hint = did_you_mean(name, sorted(known))
+                raise PoiseError(f"--set has no '{name}'", hint=hint, code="unknown-setting")
             other.append(text)
             continue
         try:
