@@ -104,8 +104,8 @@ def given(*groups: Any) -> dict[str, Any]:
 
 
 def stated(texts: tuple[str, ...], kind: type) -> tuple[dict[str, Any], list[str]]:
-    """Settings of `kind` among NAME=VALUE texts such as ppo.policy_lr=1e-4, and the other texts, which are
-    of a body (lfoot.kp=400).
+    """Settings of `kind` among NAME=VALUE texts such as ppo.policy_lr=1e-4, and the other texts, which
+    are of a body (lfoot.kp=400).
 
     Raises:
         PoiseError: a name without a dot that is neither.
