@@ -24,7 +24,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory, clip: Path) -> Path:
     """The result folder of a miniature training; tests that change it take a copy."""
 
     def make(place: Path) -> None:
-        assert main(["imitate", str(clip), "-o", str(place / "stand"), *MINIATURE]) == 0
+        argv = ["imitate", str(clip), "-o", str(place / "stand"), *MINIATURE]
+        argv.remove("--no-expert")
+        assert main(argv) == 0
 
     return copied("imitated", make, tmp_path_factory.mktemp("results")) / "stand"
 

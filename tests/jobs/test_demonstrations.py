@@ -201,7 +201,7 @@ def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
 def test_a_policy_that_fails_nothing_is_done(
     tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("stage_trainer", "run"):
+    for module in ("stage_trainer", "perpetual_run"):
         path = f"poise.jobs.perpetual.{module}.evaluate_clips"
         monkeypatch.setattr(path, Scripted(lambda *_: True))
     config = going_on(tracker.config, tiny(recovery=True), returns=True)

@@ -24,7 +24,7 @@ from poise.cli.options import (
     check_range,
     places,
 )
-from poise.cli.settings import TRACK, derived, given
+from poise.cli.settings import TRACK, derived, given, named_options
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -100,7 +100,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.synthesis.filler import check_keyframes
     from poise.synthesis.inbetween import partials_of, times_of
 
-    config = TrackConfig(**given(o.tracking), **o.directing.values())
+    with named_options("TrackConfig"):
+        config = TrackConfig(**given(o.tracking), **o.directing.values())
     times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)
     keys = tuple(range(clip.frames)) if every else keys
@@ -151,7 +152,7 @@ def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
-    if o.partial or o.retime or given(o.directing):
+    if o.partial or o.retime or given(o.directing).keys() - {"budget"}:
         raise PoiseError(
             "--kinematic has no body to direct or to wait for",
             hint="Leave it out",

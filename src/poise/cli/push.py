@@ -21,6 +21,7 @@ from poise.cli.options import (
     check_range,
     places,
 )
+from poise.cli.settings import named_options
 from poise.cli.training import working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver
@@ -84,10 +85,11 @@ def run(
     from poise.jobs.result import story
     from poise.jobs.track import TrackConfig
 
-    config = TrackConfig(
-        seed=seed, controller=controller, threads=threads, body=body, push=push,
-        smooth_hz=reading.smooth, in_place=in_place,
-    )  # fmt: skip
+    with named_options("TrackConfig"):
+        config = TrackConfig(
+            seed=seed, controller=controller, threads=threads, body=body, push=push,
+            smooth_hz=reading.smooth, in_place=in_place,
+        )  # fmt: skip
     source = reading.read(clip)
     with working("opening the policy"):
         tracker = open_run(policy).tracker

@@ -10,7 +10,8 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import field, fields, make_dataclass
 from pathlib import Path
 from types import NoneType, SimpleNamespace
@@ -101,6 +102,19 @@ def given(*groups: Any) -> dict[str, Any]:
     """What the command line states, by the name of the setting."""
     pairs = ((f, getattr(group, f.name)) for group in groups for f in fields(group))
     return {f.name: value for f, value in pairs if value != f.default}
+
+
+@contextmanager
+def named_options(kind: str) -> Generator[None]:
+    """Errors of settings of this kind name the option in place of the setting."""
+    try:
+        yield
+    except PoiseError as e:
+        name, _, rest = e.what.partition(" ")
+        if e.where != kind or not rest.startswith("must"):
+            raise
+        what = f"--{name.replace('_', '-')} {rest}"
+        raise PoiseError(what, hint=e.hint, code=e.code) from None
 
 
 def stated(texts: tuple[str, ...], kind: type) -> tuple[dict[str, Any], list[str]]:

@@ -24,7 +24,7 @@ from poise.cli.options import (
     each,
     places,
 )
-from poise.cli.settings import TRACK, derived, given
+from poise.cli.settings import TRACK, derived, given, named_options
 from poise.cli.training import clock, left, showing, staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -107,9 +107,12 @@ def config_of(o: Options) -> TrackConfig:
     from poise.plan import SamplingConfig
 
     more = given(o.tracking) | o.directing.values()
-    search = SamplingConfig(o.characters, rounds=o.rounds)
     how = {"noise": noise_of(o.noise), "supports": supports_wanted(o), "smooth_hz": o.reading.smooth}
-    config = TrackConfig(search=search, **how, **more)
+    check_range("characters", o.characters, 8, 65_536)
+    check_range("rounds", o.rounds, 1, 20)
+    search = SamplingConfig(o.characters, rounds=o.rounds)
+    with named_options("TrackConfig"):
+        config = TrackConfig(search=search, **how, **more)
     config.check(len(o.clips))
     return config
 
