@@ -196,6 +196,9 @@ BODY_MASS_INDEX = 22.0
 class PartNumbers:
     """What a preset states about a kind of part, at `RFC_MASS_KG`.
 
+    Masses are those of Winter 2009, table 4.1; the pelvis and the spine with the clavicles share the
+    trunk's 0.497. Gains and torque limits are those of the Residual Force Control humanoid.
+
     Attributes:
         mass: fraction of body mass (both sides each).
         radius: fraction of the height.
@@ -247,7 +250,15 @@ GIANT_M = 2.0
 
 @dataclass(frozen=True)
 class Strength:
-    """Factors on the numbers that are stated at `RFC_MASS_KG`.
+    """Factors on the numbers that are stated at `RFC_MASS_KG`, for a child and a giant, too.
+
+    Two bodies of one shape move alike under gravity when their Froude numbers agree (Alexander and Jayes
+    1983; Hof 1996). With mass m and length L, times go as sqrt(L / g) and
+
+        torque ~ m g L,   stiffness ~ m g L,   damping ~ m g L sqrt(L / g),   inertia ~ m L^2.
+
+    Gravity is the same for all, so each factor is a power of m and L. The gains were tried on adults of
+    `ADULT_M`: within that span they follow the mass alone, beyond it L counts from its edge.
 
     Attributes:
         torque: of torque limits and stiffness, m L.

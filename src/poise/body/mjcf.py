@@ -168,6 +168,9 @@ class MjcfBody:
 def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
     """The humanoid in an MJCF file.
 
+    The file's tree, places, hinges, ranges, masses, gains and torque limits are kept; its shapes become
+    capsules, boxes and spheres. A sentence refuses what does not fit, and a note tells what was changed.
+
     Args:
         path: the file; what it includes (meshes) is read as MuJoCo does, from its own folder alone.
             MuJoCo compiles it in a process of its own, under limits of memory and time.

@@ -68,7 +68,7 @@ class Options:
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
-    """For a clip see `doctor_motion`; for the machine exit code 0 if all is there, else 1."""
+    """For a clip see `run_on`; for the machine exit code 0 if all is there, else 1."""
     if options.clip is not None:
         if not options.clip.is_dir():
             return run_on(options.clip, options)

@@ -31,7 +31,12 @@ class Wrench(NamedTuple):
 
 
 class Residual(Protocol):
-    """A kind of residual force."""
+    """A kind of residual force: it turns an action into forces on a `Drive` and reports what it applied.
+
+    The limits bound norms: the sum over bodies of the force's norm never exceeds `limit_n`, that of the
+    torque's never `limit_nm`; zero switches the help off. Without `capped`, as in the paper, the limits
+    only scale the action, and nothing bounds the help.
+    """
 
     @property
     def limit_n(self) -> float:
@@ -208,7 +213,7 @@ class ExplicitResidual:
 
 
 class HelpSchedule(Protocol):
-    """When the help becomes less, and when more."""
+    """When the help becomes less, and when more: a scale in [0, 1] multiplies a `Residual`'s limits."""
 
     @property
     def every(self) -> int:

@@ -216,7 +216,11 @@ class AdaptiveSampling(Event):
 
 
 class BodyAssignment(Event):
-    """The bodies of a backend's worlds.
+    """The bodies of a backend's worlds: a world takes the body that its clip is for.
+
+    All bodies have the same joints, hinges and shapes; lengths, sizes, masses and strengths differ. What
+    differs between their compiled models becomes a field of each world, so that the worlds are stepped
+    together, and a new episode only copies the numbers of its body.
 
     Attributes:
         body: `(N,)`, which body each world has.

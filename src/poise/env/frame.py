@@ -128,7 +128,14 @@ class Frame:
     """Everything that a term may use, looked up by name when a term first asks for it, and kept.
 
     A name is that of an observable: a function of the frame in `env.frame`, in an event, or in
-    `TaskConfig.observables`. An observable reads tensors through `source`, or other observables.
+    `TaskConfig.observables`. An observable reads tensors through `source`, or other observables. A new
+    one is one more function, for which every term can ask by its name:
+
+        def contact_torque(frame: Frame) -> Tensor:
+            # `(N, n)` N m that contacts and limits exert on each hinge.
+            return frame.source("qfrc_constraint")[:, 6:].float()
+
+    Only tasks with a term that asks for a `source` fetch that field of MuJoCo's state.
 
     The observables that every task has:
         sim: the character now.
@@ -147,7 +154,7 @@ class Frame:
         linvel_before: `(N, B, 3)` m/s, velocities of the bodies less the reference's at its begin.
         point: where the reference's root is, in a task with recovery; else None.
         spared: `(N,)` bool, episodes that cannot end in this step; None: none is spared.
-        sizes: `(N, K)` of each character's body, see `phc_obs.shape_of`; None where all have one.
+        sizes: `(N, K)` of each character's body, see `observations.shape_of`; None where all have one.
     """
 
     sim: Pose

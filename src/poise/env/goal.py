@@ -50,6 +50,10 @@ class State:
 class Goal(State, ABC):
     """The motion that N characters are to do, told as it goes.
 
+    An environment asks for the frame that the characters are to be in `now` and for those `ahead`;
+    `extrapolated` makes the frames beyond those that are known, for all goals alike. So a control policy
+    cannot tell which goal it follows: a clip, a stream, a generator, or one of these displaced.
+
     Attributes:
         humanoid: the goal is in its coordinates; the first of `bodies`.
         bodies: all bodies, of the same joints and hinges.

@@ -1,4 +1,32 @@
-"""Observations, free of world x, y and of heading, so that a policy works anywhere."""
+"""Observations, free of world x, y and of heading, so that a policy works anywhere.
+
+Those of Perpetual Humanoid Control (Luo et al. 2023, Sec. 3.1), for B bodies and n hinges, see the next
+reference frame alone; ours see later ones, too:
+
+| PHC                                    | here              | numbers                          |
+|----------------------------------------|-------------------|----------------------------------|
+| s^p, proprioception                    | `self_state`      | 1 + 3 (B - 1) + 12 B (358 of 24) |
+| s^g-rot, goal with rotations           | `rotation_goal`   | 24 B (576)                       |
+| s^g-kp, goal of keypoints              | `keypoint_goal`   | 9 B (216)                        |
+| -, a frame of the reference later on   | `goal_later`      | 3 K + 5                          |
+| -, what the filter of actions keeps    | `last_action`     | n                                |
+| -, how the goal gives way to forces    | `yielding`        | 4 + n                            |
+| beta, limb lengths (and masses)        | `shape`           | 2 B - 1                          |
+| what the discriminator sees of a frame | `motion_features` | 13 + 3 K + 6 J + n (196)         |
+
+J are hinged bodies, K the tips: feet and hands. All are seen from the character's root: offsets from
+it, in its heading frame.
+
+Skeleton2Humanoid's policy (section 3.4.1) sees the state and what the next reference frames k differ
+from it by:
+
+    f_t = (q_t, v_t, j_t, g_t; q~_k - q_t, j~_k - j_t, g~_k - g_t, v~_k - v_t for each next frame k)
+
+q are joint angles (`next_angles`), v velocities (`next_velocities`), j joint positions seen from the
+head, g joint positions in the world (`next_joints`). Here the root's heading takes the place of the
+world, the root's turn is 6D in place of Euler angles, and velocities are exact in place of finite
+differences.
+"""
 
 from __future__ import annotations
 

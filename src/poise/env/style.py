@@ -95,7 +95,7 @@ class ClipWindows:
         if not features.terms:
             raise PoiseError(
                 "a motion prior needs to know what it sees of a frame",
-                hint="Set TaskConfig.style, for instance to phc_obs.style_terms(humanoid)",
+                hint="Set TaskConfig.style, for instance to observations.style_terms(humanoid)",
                 code="settings-conflict",
             )
         self.features, self.frames, self.weights = features, frames, weights

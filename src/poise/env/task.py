@@ -65,8 +65,8 @@ class TaskConfig:
     help_by: whether "all" worlds have one share of help left, or each "clip" or each motion "bin" its
         own, see `HelpBudget`.
     left: `(3,)` the root's local axis that points to the body's left (`Humanoid.left`): the heading of
-        every pose that a term sees is where it points on the ground, see `spatial.lateral_heading`; None
-        takes the root's twist about +Z.
+        every pose that a term sees is where it points on the ground, see `rotations.lateral_heading`;
+        None takes the root's twist about +Z.
     filter: share f of the last action that the hinges' actions keep, a_t = (1 - f) u_t + f a_(t-1) for
         what is given, u_t; what acts, counts and is copied is a_t. The first of an episode is taken as
         it is. 0 filters nothing.

@@ -35,7 +35,7 @@ def read_bvh(path: Path, options: ReadOptions) -> Clip:
     A joint's position channels replace its OFFSET, the root's too (LAFAN1 writes the first
     position into both). Where a joint below the root carries the body (Bandai: Hips, Unreal: pelvis),
     its travel becomes the clip's root path and its offset zero, so that every joint from there on moves
-    as in the file, see `travel.carried`.
+    as in the file, see `root_joint.carried`.
     """
     file = parse_bvh(path, options.rest)
     joints, rot = file.joints, _rotations(file)

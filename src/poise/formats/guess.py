@@ -344,6 +344,11 @@ def guess_up(
 ) -> Guess:
     """The vertical of a file, one of `UPS`, with its evidence.
 
+    Whatever bears weight keeps one height, stands still while it does, and lies under the body, averaged
+    over time: by Newton's law a body falls over if its weight lies beside its supports. Of the six
+    directions of a file's axes the true one fulfils that best, also where a body lies or crawls. A body
+    that stands still fulfils it along several axes, and there its posture decides.
+
     Args:
         positions: `(S, J, 3)` poses out of the motion. later: the same `LATER_S` later.
         rest: `(J, 3)` the rest pose, None where the file has none.

@@ -167,6 +167,12 @@ def marker_places(
 ) -> tuple[Tracks, list[str]]:
     """Tracks `(T, 3)` of the places that surface markers tell (NaN where missing), and notes.
 
+    The markers are those of Plug-in Gait, the CMU set and OpenCap's augmented ones, whose names end in
+    "_study". With L or R before them: ASI and PSI (or FWT and BWT, or a middle SACR), KNE with a medial
+    KNM or MKN, ANK with a medial ANM or MMA, HEE, TOE, MT1 and MT5, SHO, ELB with a medial ELM, WRA and
+    WRB, FIN, FHD and BHD; in the middle C7, CLAV, STRN and T10. Other markers (thigh and shank wands,
+    offsets) are left out.
+
     positions: `(T, K, 3)` m, Z up. known: places that are named outright, which stay as they are.
     """
     m = _Markers(names, positions)

@@ -192,7 +192,14 @@ class _Named:
 
 
 class _Machine(_Library):
-    """The pickle machine with fewer instructions, a limit on them and on the bytes of arrays."""
+    """The pickle machine with fewer instructions, a limit on them and on the bytes of arrays.
+
+    A pickle is a program for a stack machine that may call any function. This machine is the standard
+    library's in Python with the instructions that plain data need. It never looks names up, and builds
+    arrays from their bytes, so that not even NumPy's own reconstruction runs. `find_class` of the fast
+    machine in C would not do: that machine hashes any key (one of nested tuples for ever), and takes
+    memory for whatever index or length a file states.
+    """
 
     def __init__(self, data: bytes, where: str | Path):
         # Python 2 wrote bytes as text.

@@ -46,7 +46,16 @@ def looks_like_points_csv(head: bytes) -> bool:
 
 
 def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
-    """The points of a table in its own unit and axes.
+    """The points of a table in its own unit and axes: a header that names the columns, a row per frame.
+
+        # unit = m, up = Z, fps = 60
+        time,LHip_x,LHip_y,LHip_z,RHip_x,RHip_y,RHip_z,...
+        0.0000,0.112,-0.03,0.941,...
+
+    Commas, semicolons or tabs separate the cells. `time` (s) or `frame` may come first; without times,
+    the comment or the caller must state `fps`. A column `NAME_confidence` (0 to 1) may follow each
+    point. Blank cells and NaN are missing points. Unit and vertical are guessed where the comment does
+    not state them.
 
     Raises:
         PoiseError: no header, a wrong number of columns, a cell that is no number, no rate; 2D points.

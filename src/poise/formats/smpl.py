@@ -46,6 +46,8 @@ from poise.motion.skeleton import Channel, Skeleton, Source, posed, triple
 _SIDES = (("left", 1.0), ("right", -1.0))
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
+# The stated default body is our own plain table, from no model file: an average adult of 1.72 m in a
+# T-pose, rounded to whole centimetres (fingers: halves).
 # Joint, parent, offset (m; X to the person's left, Y up, Z to the front). "*" stands for a side;
 # X is mirrored on the right. The order is SMPL's.
 _BODY = (
@@ -192,6 +194,10 @@ def is_smpl(keys: Mapping[str, Any] | Sequence[str]) -> bool:
 def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """A clip from named arrays: `poses (T, 66|72|156|165)` rad (or its parts), `trans (T, 3)` m,
     `betas`, `gender`, `mocap_framerate`.
+
+    A pose is one axis-angle vector per joint on a body that stands in a T-pose along Y, facing Z; the
+    root's rotation takes that body into the world. The pelvis stands at `trans` plus its place in the
+    model's frame.
 
     22, 24, 52 or 55 joints, whatever the file turns, fingers and face included. Rest joints come
     from the file (`rest_joints`, `J` or `joints`, `(J, 3)` m) or from the stated default body.

@@ -56,7 +56,7 @@ def settled(clip: Clip, source: Clip) -> Clip:
     """The clip with its feet held where `poise doctor` says that they slide and the source's do not.
 
     Some of what stands by the doctor's rules, which know no physics, does not bear by those of
-    `kin.hold_feet`. A foot is held only where the leg follows without a jerk.
+    `kinematics.hold_feet`. A foot is held only where the leg follows without a jerk.
 
     Args:
         source: what the clip follows, frame by frame.

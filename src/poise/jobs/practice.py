@@ -8,8 +8,8 @@ where neither finds the motion.
 2. It learns the motion. Where 1 lost it, a hand leads the root meanwhile (`plan.guide`), as strong as
    the policy needs to do the motion, and fades as it succeeds.
 3. The policy alone is what is kept, if it does the motion; else the best of that, of lookahead and
-   search with what it learned, and of 1 (`track.best`). Where all of them lose it, the motion with the
-   least help is kept, which the score card and the sentences state.
+   search with what it learned, and of 1 (`jobs.result.Merit`). Where all of them lose it, the motion
+   with the least help is kept, which the score card and the sentences state.
 """
 
 from __future__ import annotations

@@ -71,6 +71,12 @@ NAMED = 8
 class Merit(NamedTuple):
     """How good an attempt is, as a tuple of which the larger one is better.
 
+    1. An attempt that is tracked (to its end, upright and on its feet where the motion is) comes before
+       one that survived to its end, and that before one that is lost.
+    2. Of those to their end the one with less help is better, of the others the one that came farther.
+    3. Then the smaller error counts, then less jerk, then less slide, each in steps within which
+       attempts are alike.
+
     Attributes:
         ended: `TRACKED`, `SURVIVED` or `LOST`.
         unhelped: less the mean force of help, N; 0 without any, and of what is lost.

@@ -157,8 +157,8 @@ def score(
     of doing nothing.
 
     Args:
-        starts: from 2 on every episode is begun so many times, each perturbed (`eval.perturb`), and the
-            figures are means over these, beside their spread.
+        starts: from 2 on every episode is begun so many times, each perturbed
+            (`score.episodes.perturb`), and the figures are means over these, beside their spread.
 
     Raises:
         PoiseError: less than one start.

@@ -1,4 +1,15 @@
-"""Feet: when they touch the floor, and with which points; how high they stand, and level soles."""
+"""Feet: when they touch the floor, and with which points; how high they stand, and level soles.
+
+What touches depends on what is asked, so there are four rules; all know a foot by points on it:
+
+- `contact_labels`: which points touch a floor of known height: low and slow.
+- `standing_labels`: the same in recordings with different floors and sliding feet.
+- `rest_height`, `stance_heights`, `lowest_and_slow`: when feet rest, to tell where the floor is.
+- `bearing`: how much either end of a sole bears, to hold it.
+
+`metrics.plausibility.foot_contacts` judges a motion by a rule of its own, and
+`motion.windows.step_contacts` are the rules of the in-betweening papers.
+"""
 
 from __future__ import annotations
 

@@ -117,10 +117,10 @@ def find_supports(
     """What a motion, standing on z = 0, rests on besides its floor; in order of time.
 
     In the spells of `beyond_a_floor` that are held or lean, inverse dynamics tells which force and
-    moment are missing (`wrench`). Still parts of the body are tried as what bears it, on a plane that is
-    level or, for a wall, upright: that which leaves the least missing is taken, until all is borne. Each
-    gets a box as large as the motion leaves room for. Spells of which more than 1 - `MOSTLY` stay
-    unborne get nothing: a partner, a swing or water bore them.
+    moment are missing (`RequiredWrench`). Still parts of the body are tried as what bears it, on a plane
+    that is level or, for a wall, upright: that which leaves the least missing is taken, until all is
+    borne. Each gets a box as large as the motion leaves room for. Spells of which more than 1 - `MOSTLY`
+    stay unborne get nothing: a partner, a swing or water bore them.
 
     Args:
         table: the body. pos, quat: `(T, B, 3)` m and `(T, B, 4)` wxyz, places of its rows.

@@ -41,6 +41,10 @@ def analytic_ik(
 ) -> np.ndarray:
     """Generalized coordinates `(T, 7 + hinges)` of a humanoid with joints where they are asked to lie.
 
+    Skeleton2Humanoid, section 3.3 and appendix A, Eqs. 5 to 24, for every humanoid that is generated:
+    each body part gets a frame from positions (`ik_frames.BodyFrames`), the frames' relative rotations
+    become hinge angles (Eq. 6), and angles are made continuous (Eq. 7).
+
     Args:
         positions: `(T, N, 3)` m, world, of the joints in `names`.
         body: the humanoid; an `IkBody` made beforehand saves milliseconds.

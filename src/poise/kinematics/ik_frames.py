@@ -63,6 +63,8 @@ class IkConfig(Checked):
 class BodyFrames:
     """World frames `(T, 3, 3)` of rows from the positions `p (T, P, 3)` of one motion.
 
+    l_ab is the vector from joint a to joint b. Of a standing body +x is left, +y up and +z forward.
+
     frames: row -> its frame, columns x, y, z; square except where an error of the paper is kept.
     knee_parent: rows of shins for which the paper states the parent's frame otherwise (Eq. 20).
     """

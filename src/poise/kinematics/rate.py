@@ -211,6 +211,8 @@ class Gait:
 class Moved:
     """One motion of a body, measured once, that is asked at several frame rates.
 
+    Played s times too fast, accelerations are s^2 times and speeds s times what they were; places stay.
+
     low: `(T)` m, height of the lowest point. com: `(T, 3)` m. floor: m, its height under the motion.
     """
 

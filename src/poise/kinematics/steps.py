@@ -567,8 +567,10 @@ def lock_feet(
 ) -> Tensor:
     """Rotations `(T, J, 4)` with the feet held still while they stand; the root's path stays.
 
-    A foot that cannot stand, since the kept frames at both ends have it in other places, takes a step,
-    and feet that swing are raised clear of the floor, see `missing_steps` and `rises`.
+    A network may say that a foot stands all through a gap while the keyframes at its ends have the foot
+    in two places. Held at both, the foot would slide from one to the other; here it takes a step
+    (`missing_steps`). A network averages what it is unsure of, so that a foot that swings hardly leaves
+    the floor; here it is raised clear of the floor (`rises`).
 
     Args:
         feet: joints; ankles with toes among them are held, others left alone.

@@ -40,7 +40,11 @@ Places = Callable[[np.ndarray], np.ndarray]
 
 
 class StreamNoise:
-    """Measures the noise of channels `(C)` sample by sample.
+    """Measures the noise of channels `(C)` sample by sample: white noise, a tremble of one frequency.
+
+    White noise is what high differences are made of: those of order k of white noise of variance s^2
+    have (2k choose k) s^2, while motion all but vanishes in them. Medians over time leave out its
+    bursts. A tremble stands out of the octaves below and above it.
 
     Args:
         groups: `(C)` from 0 on, channels that move together, as those of a joint.

@@ -181,7 +181,7 @@ class AmpConfig(Checked):
 
 
 def style_reward(logit: Tensor, config: AmpConfig) -> Tensor:
-    """r_style of D, any shape; see the module's text and `AmpConfig.loss`."""
+    """r_style of D, any shape; `Amp` has the formula of bce, `AmpConfig.loss` that of least squares."""
     if config.loss == "least_squares":
         # r = 1 - beta (D - 1)^2
         reward = 1 - config.shape * (logit - 1).square()
@@ -200,6 +200,16 @@ def adversarial_loss(agent: Tensor, demo: Tensor, loss: Loss) -> Tensor:
 
 class Amp:
     """A motion prior as the `style` of a `Trainer`.
+
+    A discriminator D tells windows of W frames of the clips ("demos") from those of the character:
+
+        L = 1/2 [ BCE(D(agent), 0) + BCE(D(demo), 1) ] + w_gp mean ||dD/dx(demo)||^2
+            + w_logit ||last weights||^2 + w_decay sum ||weights||^2
+
+        r = w_task r_task + w_style r_style,     r_style = -log(max(1 - sigmoid(D), 1e-4)) scale
+
+    PHC's Eq. 1 does not halve the energy penalty: an environment that counts the penalty in r_task gives
+    it the weight 1 / w_task.
 
     Args:
         source: the trainer's environment, which also tells how the character moves.

@@ -164,7 +164,16 @@ def carried(x: Tensor, known: Tensor, near: Neighbours) -> Tensor:
 
 
 class Between(nn.Module):
-    """The network; see the module's text. Its first weights give interpolation.
+    """The network. Its first weights give interpolation.
+
+    One encoder sees all frames at once: known frames as they are, unknown frames interpolated between
+    their nearest known neighbours. The network corrects the interpolation (delta output: Oreshkin et al.
+    2022), which goes on in the speed of the motion around the gap (`carried`). The network also sees the
+    step of every frame from the one before: a speed is a small difference of large numbers, which a
+    network that sees places alone hardly learns. Rotations are 6D columns, and all frames are seen from
+    the last frame before the gap. The distances to both neighbouring keyframes and a learned bias per
+    distance tell positions in time (Qin et al. 2022). There may be any number of keyframes, and any
+    context. An optional second encoder refines the result of the first one.
 
     Args:
         layout: the skeleton.

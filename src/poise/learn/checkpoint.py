@@ -34,6 +34,9 @@ _TEMPORARY = ".partial"
 def save_checkpoint(path: str | Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
     """Writes a checkpoint atomically: a crash leaves either the old file or the new one.
 
+    The file is safetensors. Its metadata hold one JSON object, so that weights and settings never belong
+    to different moments.
+
     Args:
         path: the file to write; its folder is made.
         tensors: named tensors of any device and dtype.

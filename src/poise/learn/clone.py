@@ -86,6 +86,10 @@ def clone(
 
         min E |(mean(s) - teacher(s)) / sigma|^2 over the states that teacher and student visit
 
+    The teacher drives round 0 with noise, so that the data hold returns to the clip. In each later round
+    the student drives most episodes itself, and the teacher says what it would have done there. The last
+    round's returns teach a critic, so that reinforcement learning can go on at once.
+
     Args:
         env: is reset here; its episodes must restart by themselves.
         teacher: acts for the environment's present state.
@@ -259,7 +263,12 @@ class LessonConfig(Checked):
 
 
 class Student:
-    """Takes lessons: asks the teacher, keeps the labels, learns from them.
+    """Takes lessons: asks the teacher, keeps the labels, learns from them, beside PPO or alone.
+
+        min E |pi(o) - label(o)|^2  over the labels kept
+
+    A label is the action that the teacher named when it was asked. Older labels are of an older policy
+    and are forgotten.
 
     Args:
         ppo: the policy that learns, and the critic by which the teacher looks ahead.

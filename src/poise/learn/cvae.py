@@ -26,8 +26,8 @@ class CVAEConfig(Checked):
         latent: size of z.
         hidden: width of the recurrent units.
         layers: widths of the layers between them and what they say.
-        decoder: "recurrent", the paper's, or "cosine", see `learn.cvae`, for which `hidden`
-            counts as well, but not `layers`.
+        decoder: "recurrent", the paper's (`CVAE`), or "cosine" (`CosineCVAE`), for which `hidden` counts
+            as well, but not `layers`.
         cosines: of "cosine", how many a past and a future are made of. 24 of 60 frames at 30 Hz go up
             to 6 Hz.
         blocks: of "cosine", pairs of layers.
@@ -60,7 +60,15 @@ class Code(NamedTuple):
 
 
 class CVAE(nn.Module):
-    """The encoder and the decoder; see the module's text.
+    """The encoder and the decoder of Residual Force Control (section 5 and appendix C.2), two GRUs.
+
+    The decoder is kappa(x_{t:t+f} | x_{t-p:t}, z). Training alone needs the encoder q(z | past, future):
+
+        h_p = GRU(past),  (mu, log s^2) = MLP[h_p; GRU(future)],
+        y_k = y_{k-1} + MLP(GRU([h_p; z; y_{k-1}]))
+
+    A frame is a row of numbers that know no place, see `synthesis.generator.features_of`. Each frame is
+    the one before it plus what the decoder says, so that a segment begins where the past ends.
 
     Args:
         features: numbers in a frame.
@@ -170,7 +178,15 @@ _LOG_VAR = (-8.0, 2.0)
 
 
 class CosineCVAE(nn.Module):
-    """The encoder and the decoder; see the module's text. What its methods do is as in `CVAE`.
+    """The encoder and the decoder as perceptrons, for futures made of cosines; its methods do what those
+    of `CVAE` do.
+
+        y(t) = y_0 + tau (1 - exp(-t / tau)) v_0 + r(t) sum_k c_k cos(pi k (t - 1/2) / f),
+        c = MLP[past; z]
+
+    y_0 and v_0 are the past's last frame and its velocity, and r(t) = min(t / 10, 1)^2. So a segment
+    goes on where the past ends and as fast, it has no frequencies above those that people move with, and
+    all its frames are made at once.
 
     Args:
         features: numbers in a frame.
@@ -406,6 +422,15 @@ class PackedFrames:
 class CVAEObjective:
     """Loss and update of a kinematic policy; see `learn.inbetween_model.InbetweenTrainer`.
 
+    The loss is the evidence lower bound of Residual Force Control's Eq. 6,
+
+        L = |x - x~|^2 / (2 beta) + max(KL(q(z | x) || N(0, I)), tolerance),
+
+    with squares of numbers in deviations, summed over a future. After the first segment a policy sees
+    its own past (Algorithm 1, line 11), so the policy learns from that, too: in a share of the batches
+    further segments follow those that the policy made. A past that is partly of another window teaches
+    the way back to motion that there is.
+
     Args:
         steps: of the whole training.
         weights: `(D)` of the squares of a frame's numbers; by default all count the same.
@@ -507,7 +532,15 @@ class CVAEObjective:
 
 
 def settling(past: Tensor, true: Tensor, future: Tensor, settle: float) -> Tensor:
-    """Futures `(N, f, D)` as they are to be after a past that is off from the true one `(N, p, D)`."""
+    """Futures `(N, f, D)` as they are to be after a past that is off from the true one `(N, p, D)`.
+
+    An offset that is gone in a segment's first frame would be a jerk. The offset dies down as a
+    critically damped spring does,
+
+        x'(t) = x(t) + (o + (v + o / s) t) exp(-t / s)
+
+    with o the last frame's offset from the truth, v its change in a frame, and s = `settle` frames.
+    """
     off = past[:, -2:] - true[:, -2:]
     o, v = off[:, 1:], off[:, 1:] - off[:, :1]
     t = torch.arange(1, future.shape[1] + 1).to(future)[:, None]

@@ -430,7 +430,10 @@ N = TypeVar("N", bound=TransitionNet)
 
 @dataclass(frozen=True)
 class Adaptation(Checked):
-    """How a network is adapted to what it is asked."""
+    """How a network is adapted to what it is asked, see `test_loss`.
+
+    The paper gives neither beta, nor the optimiser, nor which weights move. Here all weights move.
+    """
 
     iterations: Annotated[int, Range(0)] = 5
     """Passes over the test set, or over one sequence; choose them on validation."""
@@ -465,7 +468,16 @@ def smoothness_loss(root: Tensor) -> Tensor:
 
 
 def test_loss(net: TransitionNet, known: Known, filled: FilledGap, config: Adaptation) -> Tensor:
-    """Eq. 4 `(N)` of transitions that a network gave."""
+    """L_test `(N)` of transitions that a network gave (Skeleton2Humanoid, section 3.2).
+
+        L_contact = sum_t sum_f |p_f(t+1) - p_f(t)| contact_f(t+1)      (1)
+        L_smooth  = sum_t ||r(t+1) - r(t)||_2                           (2)
+        L_test    = L_contact + beta L_smooth                           (4)
+
+    t goes from 0 to T-2, f over ankles and toes. Frame 0 is the last one that was seen, frames 1 .. T-1
+    are the transition. The loss uses what the network itself says, never the truth: where the network
+    predicts that a foot stands, the foot should not move, and the root should take the shorter way.
+    """
     feet = list(net.layout.feet)
     seen = joint_positions(net.layout, known.offsets, known.past_root[:, -1:], known.past_rot[:, -1:])
     path = torch.cat((seen, filled.pos), 1)[:, :, feet]

@@ -406,7 +406,7 @@ def gaussian_kl(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Te
 class GaussianPolicy(nn.Module):
     """A policy pi(a | s) = N(mean(s), diag(sigma)^2) with a sigma that does not depend on s.
 
-    PPO asks of a policy `context`, `distribution` and `drive`. Another kind (`nets.Composer`) may draw
+    PPO asks of a policy `context`, `distribution` and `drive`. Another kind (`Composer`) may draw
     something else than the action, of a sigma that depends on s.
 
     Args:

@@ -1,4 +1,9 @@
-"""Data-parallel training: several processes, or two cores of one, that learn as one."""
+"""Data-parallel training: several processes, or two cores of one, that learn as one.
+
+Every process has environments of its own and a copy of the networks. The processes share gradients,
+statistics and decisions, so that P processes with N / P environments each do what one process does with
+N, up to the order of summation. `torchrun` starts the processes (`joined` finds them).
+"""
 
 from __future__ import annotations
 

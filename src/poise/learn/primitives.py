@@ -93,7 +93,7 @@ def compose(
     *,
     generator: torch.Generator,
 ) -> PolicyBundle:
-    """All primitives frozen under an untrained composer; see `nets.Composer`.
+    """All primitives frozen under an untrained composer; see `Composer`.
 
     PHC's paper takes "product", its code "means" with "relu" or "silu".
 

@@ -65,7 +65,12 @@ _OFFSETS = {
 
 
 def from_unity(pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places `(..., 3)` and rotations `(..., 4)` xyzw of Unity as Poise's, wxyz."""
+    """Places `(..., 3)` and rotations `(..., 4)` xyzw of Unity as Poise's, wxyz.
+
+    Unity's world is left-handed, Y up, and a model faces +Z; Poise's has Z up, and a model faces +X.
+    Unity's (x, y, z) is Poise's (z, -x, y). That is a reflection, by which a rotation about an axis
+    turns the other way: Unity's (w, x, y, z) is Poise's (w, -z, x, -y).
+    """
     x, y, z = np.moveaxis(pos, -1, 0)
     a, b, c, w = np.moveaxis(quat, -1, 0)
     return np.stack((z, -x, y), -1), np.stack((w, -c, a, -b), -1)

@@ -1,4 +1,9 @@
-"""Does a motion look physical: sliding, penetration, floating, jerk; and how much help it had."""
+"""Does a motion look physical: sliding, penetration, floating, jerk; and how much help it had.
+
+No function but `detail` and `deviations` needs a reference. The same functions measure a reference and a
+simulation, so that the two compare. Heights are metres above the ground, Z up; results are millimetres,
+or as stated.
+"""
 
 from __future__ import annotations
 
@@ -260,6 +265,8 @@ def smoothness(pos: Tensor, fps: float = PHC_FPS) -> Tensor:
 @dataclass(frozen=True, eq=False)
 class HelpAudit:
     """Help over the valid frames; zero wrenches give exactly zero.
+
+    Norms are summed over bodies, not vectors: two opposite pushes on two bodies are help, not zero.
 
     Attributes:
         force_mean_n: N, mean over frames of `sum_m ||F_m||`.

@@ -1,4 +1,8 @@
-"""How closely a motion follows its reference: position, velocity and acceleration errors, success."""
+"""How closely a motion follows its reference: position, velocity and acceleration errors, success.
+
+Positions are `(..., T, B, 3)` in metres, world, Z up; errors are in millimetres per frame. The
+definitions are those of UHC's and PHC's evaluation (Luo et al. 2021, 2023).
+"""
 
 from __future__ import annotations
 
@@ -62,8 +66,9 @@ def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
 def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
     """MPJPE after the best similarity (rotation, translation, scale) per frame, mm; returns `(..., T)`.
 
-    Procrustes: with centred X, Y the rotation R of `Y^T X` (`spatial.best_rotation`), with the singular
-    values S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
+    Procrustes: with centred X, Y the rotation R of `Y^T X` (`rotations.best_rotation`), with the
+    singular values S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are
+    excluded.
     """
     _check_pair(pos, ref)
     x, y = pos.double(), ref.double()

@@ -26,7 +26,8 @@ class NoiseInput(NamedTuple):
     """What noise acts on: named points, or a pose.
 
     pos: `(T, K, 3)` m, NaN where a point is missing; of a pose the root alone, `(T, 1, 3)`.
-    rot: `(T, J, 4)` wxyz, a pose's local rotations; None for points.
+    rot: `(T, J, 4)` wxyz, a pose's local rotations; None for points. A point that is lost becomes NaN; a
+    pose, which must be whole, holds what was last seen.
     fps: frames per second. pairs: left and right, see `side_pairs`.
     """
 

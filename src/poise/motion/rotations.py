@@ -1,4 +1,9 @@
-"""Unit quaternions in wxyz order, rotations from directions, forward kinematics of a tree of joints."""
+"""Unit quaternions in wxyz order, rotations from directions, forward kinematics of a tree of joints.
+
+A quaternion rotates local vectors into the parent frame. Every function takes tensors with any leading
+batch dimensions and is free of side effects. Angles are radians. Products read right to left:
+`quat_mul(a, b)` applies `b` first.
+"""
 
 from __future__ import annotations
 

@@ -75,7 +75,10 @@ class Spectrum:
         return np.abs(self.hz - hz) <= max(0.06, 0.25 * self.width)
 
     def floor(self) -> np.ndarray:
-        """`(G)` variance of the white noise in each group: the mean over the bands that are flat."""
+        """`(G)` variance of the white noise in each group: the mean over the bands that are flat.
+
+        White noise ends the spectrum's fall at a floor that all joints reach.
+        """
         edges = BANDS * self.fps / 2
         bands = np.stack(
             [self.power[(self.hz >= a) & (self.hz < b + 1e-9)].mean(0) for a, b in pairwise(edges)]
@@ -94,7 +97,12 @@ class Spectrum:
         return bands[first:].mean(0)
 
     def tremble(self) -> float | None:
-        """The frequency (Hz) of the clearest tremble, None without any."""
+        """The frequency (Hz) of the clearest tremble, None without any.
+
+        People's joints are slow: above some 2 Hz the spectrum of every joint falls with frequency, and a
+        gait has more power an octave below than in its harmonics. A tremble stands out of the octave
+        below it and the octave above it, in most joints at once.
+        """
         total = self.channels.sum(0)
         alive = self.channels[:, total > STILL * total.max()]
         # Bins of a quarter of a tone's width, each with its largest power.

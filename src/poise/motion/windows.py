@@ -1,4 +1,12 @@
-"""Frames of many clips packed as arrays, windows cut from them, and motion seen in a mirror."""
+"""Frames of many clips packed as arrays, windows cut from them, and motion seen in a mirror.
+
+The windows follow the LAFAN1 protocol (Harvey et al., "Robust Motion In-betweening", 2020), which is
+stated with Y up in centimetres. Poise keeps metres and Z up: the turn between both (x, y, z) ->
+(x, -z, y) permutes coordinates and signs of positions and of the vector parts of quaternions, and keeps
+X. The protocol's figures are blind to that and to the unit (differences are divided by the deviations of
+the same coordinates), so that they come out as published; only the heading's local axis and the contact
+thresholds are converted.
+"""
 
 from __future__ import annotations
 

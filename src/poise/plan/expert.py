@@ -193,6 +193,10 @@ def inverse_dynamics(
 ) -> InverseDynamics:
     """Torques, floor forces and the remaining root wrench of T instants, each on its own.
 
+    The equations of motion M q'' + c - passive = S^T tau + J^T f + S_r^T w leave open how the floor's
+    forces f and a wrench w on the root share the load. Here f carries as much as its friction cones
+    allow, so that w, which no body can produce by itself, is as small as possible:
+
         b = M q'' + c - passive;   min |b_root - (J^T f)_root|^2 + effort^2 |f|^2
         over f in the pyramids |f_x| + |f_y| <= mu f_z;   tau = b_hinges - (J^T f)_hinges
 
@@ -341,7 +345,8 @@ def make_plan(reference: Reference, config: ExpertConfig | None = None) -> Plan:
 class Expert:
     """Acts in one `ImitationEnv` with full knowledge of its state, whatever its observation is.
 
-    A teacher for `poise.learn.clone`, and a policy that `poise.score` can score.
+    The expert needs no learning and follows most clips. It is a teacher for `poise.learn.clone`, and a
+    policy that `poise.score` can score.
 
     Raises:
         PoiseError: explicit residual forces that do not reach the root.

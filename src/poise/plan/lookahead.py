@@ -314,6 +314,20 @@ class _World:
 class Lookahead:
     """Acts as a policy does, after it has looked ahead; `watch` tells it which environment it acts in.
 
+        control = Lookahead(copies, policy, value)
+        control.watch(env)
+        simulate(env, control, obs, steps)
+
+    Every few control steps the worlds of `copies` become copies of the character as it stands. Each copy
+    acts as the policy plus an offset of its own (`Changes`), is simulated some steps ahead, and costs
+
+        c = - sum_h gamma^h r_h - gamma^H V(o_H) + prices,
+
+    with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`Roughness.price`).
+    Each control step in which the motion is lost costs `LOSS`, more than all of that. The character then
+    does what the best copy began with. A copy sees no more of the goal than the goal tells: a clip its
+    frames, a stream or a generator what it knows.
+
     Args:
         copies: an environment of the same body and kind of goal in which it tries, of as many worlds as
             there are candidates: without ends and automatic restarts, with rewards (`Imitation.bare`).

@@ -1,10 +1,10 @@
 """One policy for bodies of many shapes: the library on variants of its body, which is observed.
 
-PHC (Luo et al. 2023, Sec. 3.1) tells its policy the SMPL shape beta; here `phc_obs.shape` tells limb
-lengths and masses, and training goes over S bodies. The first is the library's own. In the others each
-part has another size, drawn per group of `GROUPS` and alike on both sides: its length and its girth are
-scaled together, so that its mass goes with the cube at equal density. Strength follows mass and height
-as everywhere (`body.body_table.Strength`).
+PHC (Luo et al. 2023, Sec. 3.1) tells its policy the SMPL shape beta; here `observations.shape` tells
+limb lengths and masses, and training goes over S bodies. The first is the library's own. In the others
+each part has another size, drawn per group of `GROUPS` and alike on both sides: its length and its girth
+are scaled together, so that its mass goes with the cube at equal density. Strength follows mass and
+height as everywhere (`body.body_table.Strength`).
 
 Every clip is retargeted onto the bodies that do it, so that feet stand where they stood, and counts as a
 clip of its own, "walk@3" on body 3: episodes, hard negatives and evaluations need know nothing of it. A
@@ -119,7 +119,7 @@ def shaped(
     keep their names on it and are called NAME@K on body K; cyclic clips go on in cycles there alone.
 
     Args:
-        make_task: makes the task for a humanoid; its observation `phc_obs.shape` then is that
+        make_task: makes the task for a humanoid; its observation `observations.shape` then is that
             of each world's own body.
 
     Raises:

@@ -219,7 +219,7 @@ class Imitation:
             style: a motion prior's settings, for which the task must have `TaskConfig.style`; or a style
                 of your own, with the `env` that it watches.
             env: in place of a fresh environment.
-            lessons: a teacher and how is learned from it, see `teacher`.
+            lessons: a teacher and how is learned from it, see `plan.teacher`.
         """
         if env is None and style is not None and not isinstance(style, AmpConfig):
             raise PoiseError(

@@ -1,4 +1,25 @@
-"""Perpetual Humanoid Control: one policy for a whole library."""
+"""Perpetual Humanoid Control for Real-time Simulated Avatars: one policy for a whole library.
+
+Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
+
+| paper                                             | here                                         |
+|---------------------------------------------------|----------------------------------------------|
+| Sec. 3.1 s^p, s^g-rot, s^g-kp, beta               | `env.observations`                           |
+| Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.rewards`, `learn.Amp`                   |
+| Sec. 3.1 relaxed early termination                | `env.rewards`, `all_but_feet`                |
+| Sec. 3.2 progressive primitives, hard negatives   | `papers.perpetual.primitive_stages`          |
+| Alg. 1, line 3: until success no longer improves  | `learn.mining`                               |
+| lateral connections, weight sharing               | `learn.primitives`, `networks.ProgressiveNet` |
+| fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.rewards`                |
+| P^(F) on Q^loco; interleaved recovery             | `walking_clips`, `jobs.perpetual.stages`     |
+| in place of them, by default: recovery motions    | `env.recovery.planner`                       |
+| Eqs. 5, 6 multiplicative composer                 | `learn.composer.Composer`                    |
+| Sec. 4, success: mean distance within 0.5 m       | `jobs.perpetual.evaluation`                  |
+
+Three things are ours. One network learns all clips; training by stages is `papers.perpetual`. Training
+begins with a clone of a scripted expert. A residual force helps at first, and success takes it away
+(`control.SuccessHelp`): at the end of every stage there is no help.
+"""
 
 # pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
@@ -31,7 +52,12 @@ from poise.recipes.perpetual_settings import Perpetual, Recovers
 
 
 def noisy(imitation: Imitation, strengths: Sequence[float], seed: int = 0) -> Imitation:
-    """The same task with each clip once more for every strength; unchanged for none.
+    """The same task with each clip once more for every strength ("walk~0.25"); unchanged for none.
+
+    A pose estimator's stream jitters, jumps, loses frames and swaps sides, and a policy that has only
+    been told clean motion follows all of that. Here the observation's goal and what additive actions add
+    to are noisy, while episodes begin on the clean clip, and rewards, failures and evaluations are those
+    of the clean clip.
 
     A clip with noise is in no cycle. Its noise is that of `seed` and of its name.
 
@@ -83,6 +109,9 @@ SECONDS = 1.0
 
 def walking_clips(reference: Reference) -> Tensor:
     """`(C,)` bool on the CPU: clips that walk or stand, for the recovery primitive.
+
+    The paper picks walking and running by hand for that primitive (Q^loco), so that the motion prior
+    knows nothing else; here rules do.
 
     In all frames the root is about as high, and the body about as tall, as in standing, the root does
     not move fast, and on average the limbs move about the root no faster than in a walk. All clips if
@@ -243,7 +272,7 @@ def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[Rew
 
 
 def _soles(humanoid: Humanoid) -> dict[str, Tensor]:
-    """Points of the feet for `phc_reward.foot_slide`."""
+    """Points of the feet for `rewards.foot_slide`."""
     count, shapes = len(humanoid.bodies), shapes_of(humanoid.table, torch.float32)
     still = torch.zeros(count, 3), torch.eye(4)[:1].expand(count, 4)
     points = [foot_points(*still, shapes, [foot]) for foot in humanoid.feet]
@@ -286,7 +315,7 @@ def build(
     table: BodyTable | None = None,
     known: RecoveryClips | None = None,
 ) -> Imitation:
-    """Body, reference and task for a library of one skeleton; train it with `perpetual.run.train`.
+    """Body, reference and task for a library of one skeleton; train it with `perpetual_run.train`.
 
     table: the body of a policy that goes on to learn, see `fit_humanoid`; by default one is made.
     known: the recovery clips of that policy; by default those of the library.

@@ -86,7 +86,7 @@ class PushPlan(Checked):
 
     Attributes:
         share: of the episodes that are pushed.
-        newtons, every_s, lasts_s, impulse_ns: see `env.events.Pushes`.
+        newtons, every_s, lasts_s, impulse_ns: see `env.pushes.Pushes`.
         parts: kinds of bodies of which one is pushed.
         level: between which the level of compliance is drawn in each episode.
     """
@@ -123,16 +123,16 @@ class Perpetual:
         action: "absolute" as in the paper, or "additive" to the reference's angles.
         faithful: where the paper and its code disagree about Eq. 2 and about recovery.
         energy: weight of the energy penalty, 0 for none; by default that of the code's composer, since
-            with ten times as much falling early would pay, see `phc_reward.energy_term`.
+            with ten times as much falling early would pay, see `rewards.energy_term`.
         energy_form: of the "paper", squares of the hinges' power, or of the "code", its amount.
-        root: weight of the reward for the root's place alone, see `phc_reward.root_position`.
+        root: weight of the reward for the root's place alone, see `rewards.root_position`.
         action_rate, torque_rate, acceleration, foot_slide: prices of changing actions and torques, of
-            bodies accelerated otherwise than the reference's and of feet that slide, see `phc_reward`;
+            bodies accelerated otherwise than the reference's and of feet that slide, see `env.rewards`;
             with several bodies the soles are those of the first.
         noise: each clip is learned once more with so many times a video estimator's noise, such as
             (0.25, 0.5), of which the policy is told, and is judged by the clean clip, see `noisy`.
         pushes: a share of the episodes is pushed, and goals give way; the policy observes how, see
-            `phc_obs.yielding`. None: neither.
+            `observations.yielding`. None: neither.
         style: the motion prior, None for none.
         termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
             "code".

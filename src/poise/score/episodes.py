@@ -55,6 +55,9 @@ def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observer
     """Lets a policy act in all worlds from where they stand, for `steps` control steps or until every
     observer has seen enough.
 
+        obs = env.reset_to(clip, start)
+        simulate(env, policy, obs, steps, Recorder(env, clip, start))
+
     Args:
         env: without automatic reset; it is not closed here.
         policy: acts on raw observations, deterministically.
@@ -369,6 +372,9 @@ VERSION = 1
 @dataclass(frozen=True, eq=False, repr=False)
 class Transitions:
     """S control steps of E episodes, one after another.
+
+        steps = open_run("out").transitions(most=16)
+        steps.save("rollouts.npz")
 
     Attributes:
         obs: `(S, O)` float32, what the policy saw before the step, not normalised.

@@ -290,6 +290,10 @@ class ClipResults:
 class ClipJudge:
     """Observes clips from their first frames and keeps of each what it came to.
 
+    PHC's evaluation: a clip fails where the mean distance of the bodies exceeds 0.5 m in any frame
+    (`metrics.has_lost`). The judge records no frames, so that a library of thousands of clips can be
+    evaluated while a policy learns it.
+
     last: `(E,)` the last frame of each world's clip.
     """
 

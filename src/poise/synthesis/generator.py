@@ -170,7 +170,12 @@ ROOT = 10
 
 
 def features_of(qpos: Tensor, fps: float) -> Tensor:
-    """Frames `(T, 10 + n)` of coordinates `(T, 7 + n)`; the first one moves as the second does."""
+    """Frames `(T, 10 + n)` of coordinates `(T, 7 + n)`, which know no place and no heading.
+
+    A frame is (v, w, z, r, q): the root's horizontal velocity in its own heading, m/s (2), the speed of
+    its heading, rad/s (1), its height, m (1), its turn without heading, 6D (6), and the hinge angles,
+    rad (n). Velocities are those from the frame before; the first frame moves as the second does.
+    """
     root, turn = qpos[:, :3], qpos[:, 3:7]
     heading = heading_quat(turn)
     step = quat_rotate(quat_conj(heading[1:]), torch.diff(root, dim=0)) * fps

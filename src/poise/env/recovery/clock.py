@@ -1,4 +1,25 @@
-"""Falls and far starts as parts of episodes, and which worlds recover, from what, and since when."""
+"""Falls and far starts as parts of episodes, and which worlds recover, from what, and since when.
+
+A task with a `Recovery` has these kinds of episodes (PHC Secs. 3.2 and 3.3), a task without one has only
+the first:
+
+| kind        | begins                                      | the reference         |
+|-------------|---------------------------------------------|-----------------------|
+| tracked     | on the reference                            | goes on               |
+| fallen      | lying on the floor under it                 | waits `grace` steps   |
+| far         | on it, but metres beside it                 | goes on               |
+| fallen, far | both                                        | waits                 |
+| continued   | where a failure would have ended an episode | waits                 |
+
+A character that recovers cannot fail. Its episode does not end with the clip, whose last frame then
+stands still, before the root has come as near as `switch` and stayed for `settle` steps, with no wait
+left.
+
+**Point goal** (Eq. 3): while the root is farther than `switch` from its reference, the goal tells only
+where the reference's root is and how it is turned, see `toward`. The point goal and the rewards that
+count (`RewardTerm.when`) depend on that distance alone, also in tracked episodes and in evaluations, so
+that a policy sees the same in all of them.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +47,7 @@ TRACKED, FALLEN, FAR, CONTINUED = 0, 1, 2, 4
 
 @dataclass(frozen=True)
 class Recovery:
-    """How often episodes are about recovery, and what it is; see the module.
+    """How often episodes are about recovery, and what it is; the module lists the kinds.
 
     Attributes:
         fallen, far: probabilities that an episode begins fallen and that it begins far, drawn apart.

@@ -1,4 +1,14 @@
-"""Recovery motions: from where characters lie, up and over to where a motion is entered again."""
+"""Recovery motions: from where characters lie, up and over to where a motion is entered again.
+
+The recovery clips of a library (`env.recovery.clips`) give a recovery motion for any start:
+
+    lying -> blended -> a clip that gets up -> the walk, steered -> at ease
+
+It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
+track such motions finds what physics allows. Turning follows a unicycle: the heading turns toward the
+place at no more than `Pace.turn` rad/s, and the walk's stride shortens by the cosine of the turn that is
+left. To a place that is near and behind, the walk is played from its end to its start.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Trains a kinematic policy on a folder of clips, in a run folder."""
+"""Trains a kinematic policy on a folder of clips, in a run folder.
+
+run/
+    motions.safetensors     the library on the body, and the settings: all that training needs
+    checkpoint.safetensors  the training as it stands
+    generator.safetensors   the kinematic policy
+    log.csv                 the learning curve
+"""
 
 from __future__ import annotations
 
@@ -58,8 +65,8 @@ class Endless(Checked):
     """Settings of a kinematic policy's training.
 
     Attributes:
-        net: sizes and kind of the network, see `learn.cvae`.
-        training: see `learn.cvae`.
+        net: sizes and kind of the network, see `learn.cvae.CVAEConfig`.
+        training: see `learn.cvae.CVAETraining`.
         steps: steps of the whole training.
         ema: how much of the averaged weights stays at each step.
         codes: windows of the library that are kept as codes, from which z is drawn; 0 draws z from
@@ -141,7 +148,7 @@ def read_motions(
     folder: Path, tracker: Tracker, sizes: CVAEConfig, hold_out: Sequence[str] = (),
     tell: Callable[[str], None] = lambda _: None, **how: object,
 ) -> Motions:  # fmt: skip
-    """A folder's clips on a policy's body; `how` as `perpetual.run.clips_of` takes it."""
+    """A folder's clips on a policy's body; `how` as `perpetual_run.clips_of` takes it."""
     body = tracker.config.body
     library, notes = clips_of(folder, body, hold_out, tell=tell, onto=tracker.target, **how)  # type: ignore[arg-type]
     for note in notes:

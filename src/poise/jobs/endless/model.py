@@ -45,7 +45,7 @@ class GeneratorModel:
     """A kinematic policy ready to use.
 
     Attributes:
-        net: see `learn.cvae`.
+        net: see `learn.cvae.make_cvae`.
         seeds: `(S, p, 7 + n)` pasts from which motions begin.
         bounds: `(2, n)` rad, least and most of each hinge in the library.
         hinges: names of the body's hinges, in order.
@@ -179,6 +179,10 @@ class Label(NamedTuple):
 def read_labels(path: Path) -> tuple[Label, ...]:
     """The labels of a file; of a folder those of its `labels.txt`, none where there is none.
 
+        # a label, and a regular expression that names of its clips match; the first that fits counts
+        walk   walk|^07_
+        dance  salsa
+
     Raises:
         PoiseError: a line says something else.
     """
@@ -226,7 +230,7 @@ def kinds_of(clips: Sequence[str], labels: Sequence[Label]) -> Tensor:
 
 
 def clips_of_seeds(motions: Motions, past: int) -> Tensor:
-    """Which clip each of `motions.seeds` is of, `(S,)`; as `training.motions_of` picks them."""
+    """Which clip each of `motions.seeds` is of, `(S,)`; as `endless_training.motions_of` picks them."""
     sizes = torch.diff(motions.frames.first).tolist()
     clips = [c for c, n in enumerate(sizes) for _ in range(0, n - past, past)]
     return torch.tensor(clips)[spread(len(clips), len(motions.seeds))]

@@ -1,4 +1,15 @@
-"""In-betweening networks from a folder of clips: Harvey et al. 2020, and a transformer."""
+"""In-betweening networks from a folder of clips: Harvey et al. 2020, and a transformer.
+
+| paper | here |
+|---|---|
+| Harvey et al., section 3: the recurrent transition network | `papers.skeleton2humanoid.rtn` |
+| its windows, split by actor, L2Q, L2P, NPSS | `motion.windows`, `metrics.gap_errors`, `score.gaps` |
+| Skeleton2Humanoid, Eqs. 1 to 4: test-time adaptation | `learn.inbetween_model.adapt` |
+| delta to interpolation (Oreshkin et al.), relative times (Qin et al.) | `learn.between` |
+
+A run folder holds `frames.safetensors` (the packed library), `run.safetensors` (settings),
+`checkpoint.safetensors`, the log, and at the end `model.safetensors`.
+"""
 
 # pyright: reportUnknownMemberType=false
 from __future__ import annotations

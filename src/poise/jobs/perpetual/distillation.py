@@ -94,6 +94,10 @@ def distilled(
 ) -> WarmStart:
     """A policy, and its critic, for `imitation` that does as a trained one does where it comes to.
 
+    This is DAgger. A policy that is told places alone (PHC's second goal, s^g-kp) cannot add to angles
+    that it does not know, and learns them slowly by its rewards. A policy that is told rotations says at
+    once what to do in the same state.
+
     start: the policy that is taught, by default a new one; device, worlds: of the characters, of which
     there are no more than the settings name.
     """

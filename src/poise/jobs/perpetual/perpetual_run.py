@@ -1,4 +1,13 @@
-"""A run of the perpetual controller in a folder: begun, trained, evaluated, opened, kept as a file."""
+"""A run of the perpetual controller in a folder: begun, trained, evaluated, opened, kept as a file.
+
+run/
+    run.safetensors         the clips and the settings, all that the run needs to be rebuilt
+    checkpoint.safetensors  the stage in progress with everything that decides what comes next
+    primitive-K.safetensors each primitive as it was when its stage ended; recovery.safetensors likewise
+    policy.safetensors      the policy of the finished run
+    log.csv, success.csv    the learning curve; every evaluation of every clip
+    result.json             what the finished run came to, without help
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The stage machine: a library's training goes from stage to stage by itself, as evaluations decide."""
+"""The stage machine: a library's training goes from stage to stage by itself, as evaluations decide.
+
+A `StageOrder` says which stage follows which and how one begins. A checkpoint is the whole machine
+between two iterations. A new stage replaces the checkpoint of the last one in one step, so that a run
+that was killed anywhere goes on as if nothing had happened.
+"""
 
 from __future__ import annotations
 

@@ -115,13 +115,20 @@ def learn(
 ) -> LearnedMotion:
     """Trains until the motion is tracked from its first frame to its last, or a limit is reached.
 
+    A policy that knows a thousand motions begins by following most of the next one.
+
+        tracked = track(clip, tracker)
+        if tracked.failures:
+            until = Until(minutes=10)
+            tracker = learn(tracker, tracked.placed, Path("out/learned"), until).tracker
+
     Args:
-        folder: of the run, `perpetual.run`; one that holds a run of this motion is gone on with.
-        on_iteration, threads, device: see `perpetual.run.train`.
+        folder: of the run, `perpetual_run`; one that holds a run of this motion is gone on with.
+        on_iteration, threads, device: see `perpetual_run.train`.
         starts: the motion is to be tracked from so many frames, evenly spread, see `Perpetual.starts`.
         supports: see `TrackConfig`.
-        help_n: N and N m, with which a hand leads the root at first, see `helping`; a run that is gone
-            on with has its own.
+        help_n: N and N m, with which a hand leads the root at first, see `with_guide`; a run that is
+            gone on with has its own.
 
     Raises:
         PoiseError: a policy of primitives, which cannot go on, or a folder with another run.

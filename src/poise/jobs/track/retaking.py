@@ -69,6 +69,10 @@ def retaken(
 ) -> tuple[TrackingRun, Sequence[str]]:
     """Does a part of a task's motion anew, and the rest as it was done; sentences on that.
 
+    The character begins in the stored state of the part's first frame and follows the motion. Toward the
+    part's end its goal becomes the earlier simulation, which the character then follows for a while. The
+    new simulation fades into the earlier one where the two are nearest.
+
     Raises:
         PoiseError: the earlier result is of another motion or body, the part lies outside of it, or no
             seed does it.

@@ -33,7 +33,7 @@ class Simulation:
 
     Attributes:
         qpos: `(T, 7 + n)` m, wxyz and rad.
-        qvel: `(T, 6 + n)` m/s and rad/s, see `kin.qpos_velocity`.
+        qvel: `(T, 6 + n)` m/s and rad/s, see `kinematics.coords.qpos_velocity`.
         action: `(T - 1, A)` as they acted from each frame to the next.
         rate_hz: control rate.
         bodies, hinges: names of the humanoid's.

@@ -33,7 +33,11 @@ _NO_MEMORY_FPS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PointBody:
-    """A measured performer and the humanoid that it moves.
+    """A measured performer and the humanoid that it moves, each frame by itself.
+
+    `calibrate` measures the performer once. After that a frame needs no other frame: the measured
+    skeleton is posed in closed form, its bones' directions pass to the humanoid's skeleton, and the path
+    is scaled. Contacts are not held, since that needs to know what comes.
 
     names: labels of the keypoints. onto, table: the humanoid's skeleton and bodies. rest, share, bones:
     the measured skeleton. passage: from it to the humanoid. lift: m, how far the humanoid is

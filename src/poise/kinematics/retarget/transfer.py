@@ -118,6 +118,11 @@ def with_rest_pose(clip: Clip) -> RestPoseResult:
     Every joint stays where it is in every frame; its frame turns. The T-pose faces along -Y, which is
     +Z in files with Y up; its joints' frames are the world's.
 
+    Let R_j be the world rotations of a pose of the old skeleton, and p_j the places of its joints there.
+    If the new skeleton has the offsets p_j - p_parent, it stands in that pose with all rotations zero.
+    With G_j R_j^-1 in place of the world rotations G_j of a motion every joint is where it was, since
+    G_p R_p^-1 (p_j - p_p) is G_p o_j.
+
     Raises:
         PoiseError: a skeleton that is no human's.
     """

@@ -39,7 +39,10 @@ FALLEN = 0.7
 
 @dataclass(frozen=True)
 class Measured:
-    """One hand, pushed in one direction.
+    """One hand, pushed in one direction: how stiff a character that stands is there.
+
+    A constant force acts along an axis, and x is how far the hand comes to rest from where it stands
+    without the force; K = f / x along the force.
 
     Attributes:
         commanded: N/m, or the level of compliance; None without either.
@@ -190,7 +193,10 @@ def throws(
     threads: int = 0,
     show: Callable[[int, int], None] | None = None,
 ) -> Thrown:
-    """The same throws at each level, by the policy alone.
+    """The same throws at each level, by the policy alone (Deep Compliant Control, Sec. 5.2 and Fig. 4).
+
+    A ball comes at 2 to 3 m/s from a random direction, once. Up to the first contact the worlds of all
+    levels are the same to the last bit.
 
     Args:
         given: how the character gives way; its level or stiffness is what `levels` replace.

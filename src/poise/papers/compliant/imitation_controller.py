@@ -1,4 +1,17 @@
-"""Deep Compliant Control's imitation controller: state, features, rewards (Secs. 4.1, 4.2)."""
+"""Deep Compliant Control's imitation controller: state, features, rewards (Secs. 4.1, 4.2).
+
+| paper                                      | here                                     |
+|--------------------------------------------|------------------------------------------|
+| Sec. 4.1 Eq. 11 r_imit = r_q r_p           | `AmpConfig.product`, `root_place`        |
+| Eqs. 12, 13 the discriminator's r_q        | `AmpConfig.compliant`, `posture`         |
+| Eq. 14 r_p                                 | `root_place`                             |
+| Sec. 4.2 s = s(q (-) u), two poses, u      | `two_poses`, `turns`, `displacement`     |
+| Sec. 5.1 network, PPO, noise of 6 degrees  | `CompliantImitation.paper`               |
+| Sec. 3, 5.2 compliance                     | `TaskConfig.compliance`                  |
+
+Policy and discriminator both see q (-) u. Terms ask for `frame.shifted`; in frames of clips, which know
+of no displacement, that is None, and the clip's own pose is taken.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +92,7 @@ def root_place(
 
 
 def posed_place(frame: Frame, alpha: float = 2.0) -> Tensor:
-    """r_q r_p with a measured r_q in place of the discriminator's: `reward.pose`, which follows the
+    """r_q r_p with a measured r_q in place of the discriminator's: `rewards.pose`, which follows the
     displaced reference joint by joint."""
     return pose(frame, alpha) * root_place(frame)
 

@@ -1,4 +1,8 @@
-"""The motions of scenes for which no clip comes along: made of key poses, standing, hopping."""
+"""The motions of scenes for which no clip comes along: made of key poses, standing, hopping.
+
+The key poses are the policy's pose at ease, moved. The in-betweening network that comes with Poise makes
+the steps between them, and inverse kinematics leads a hand. No recording of a person is in them.
+"""
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false

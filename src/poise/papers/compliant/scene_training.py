@@ -1,4 +1,23 @@
-"""Scenes learned while giving way: a policy on top of another one (Deep Compliant Control)."""
+"""Scenes learned while giving way: a policy on top of another one (Deep Compliant Control).
+
+| paper                                     | here                                               |
+|-------------------------------------------|----------------------------------------------------|
+| Sec. 3 compliance-induced motion, Eq. 8   | `control.compliance`, `env.yielding`               |
+| Sec. 5.3, 5.4 scenes, states and rewards  | `scenes`                                           |
+| Eq. 10 r = w_imit r_imit + w_task r_task  | `task`                                             |
+| Sec. 4 imitation controller               | the universal policy, with a learned one on top    |
+| Sec. 4.2 state (s_dyn, u, s_task)         | `seen`: the root, u, and what the scene tells      |
+| Sec. 5.4 six fictional forces as actions  | `Compliant.forces`                                 |
+
+The paper's controller learns all of a motion from nothing by an adversarial reward, see
+`imitation_controller`. Here the policy that tracks any motion follows the displaced goal, and the policy
+on top learns what the scene's task asks for beside that.
+
+run/
+    compliant.json          the settings
+    checkpoint.safetensors  the training as it stands, with the policy on top
+    log.csv                 the learning curve
+"""
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false

@@ -273,6 +273,16 @@ DAMPING = (1e-3, 30.0)
 class TrajectoryOptimizer:
     """Optimises the trajectories of all clips, an iteration at a time.
 
+    The optimiser is iLQR along all clips at once (Tassa et al. 2012), with three additions for a human
+    on stiff contacts:
+
+    - `lqr.linearise` takes the linear model over large differences, about a tenth of a radian;
+    - at first a wrench on the root may help; its price rises wherever the character is near its
+      reference: the curriculum of residual forces (Skeleton2Humanoid, Eq. 9), for each shooting segment
+      by itself;
+    - each segment of some seconds chooses its own step, among rollouts that are made side by side
+      (multiple shooting), since one hard second must not hold up a minute of motion.
+
     Raises:
         PoiseError: clips of several bodies.
     """

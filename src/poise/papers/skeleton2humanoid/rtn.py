@@ -86,7 +86,14 @@ class RtnOutput(NamedTuple):
 
 
 class RTN(nn.Module):
-    """The generator; see the module's text.
+    """The generator, "Robust Motion In-betweening" (Harvey et al. 2020), section 3.
+
+    Three encoders (state, offset to the target, target), a time-to-arrival embedding z_tta, scheduled
+    target noise, one LSTM and a decoder say frame after frame what changes:
+
+        h = LSTM([E_s(q, v, c); E_o(r_T - r, q_T - q); E_q(q_T)] + z_tta),  (dq, dr, c) = D(h)
+
+    Where the paper is silent, values are those of its public re-implementations, see `RTNConfig`.
 
     Args:
         layout: the skeleton.

@@ -381,7 +381,8 @@ def result_html(
     """A self-contained piece of HTML, a few tens of kB, all text escaped.
 
     source: what the motion is of, drawn grey beneath it, on the same skeleton. rows: (label, value,
-    unit, verdict), see `eval.table`. keys: frames that are drawn in the ink's colour, such as keyframes.
+    unit, verdict), see `score.card.table`. keys: frames that are drawn in the ink's colour, such as
+    keyframes.
     """
     frames, ghost = clip.frames, None
     if source is not None and source.skeleton.names == clip.skeleton.names:
