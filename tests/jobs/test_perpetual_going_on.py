@@ -162,7 +162,7 @@ def test_a_policy_goes_on_while_it_is_pushed_and_sees_its_goal_give_way(
     assert not obs[:, columns].any()
     env.close()
     # In training some is measured and seen: levels as they were drawn, and the displaced goal.
-    assert float(start.policy.norm.std[-columns]) > 0.01
+    assert float(start.policy.norm.std[columns.start]) > 0.01
     write = begin(tmp_path, library(), task.config, earlier=tracker)
     stages = StageTrainer(write, tmp_path, Until(iterations=1), 1, tensorboard=False, trained=start)
     stages.iterate()

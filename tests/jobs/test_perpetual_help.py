@@ -19,6 +19,7 @@ from poise.jobs.perpetual.evaluation import StageRecord, evaluate_clips, mean_he
 from poise.jobs.perpetual.perpetual_run import begin
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import config_of
@@ -198,7 +199,7 @@ def test_a_checkpoint_with_one_scale_for_all_goes_on_by_clip(
     """Settings of before there was help by clip or moment say that all share one."""
     config, until = tiny(single=True, expert=False, help_by="clip"), Until(iterations=8)
     old = {k: v for k, v in to_data(config).items() if k not in ("help_by", "adaptive_sampling")}
-    assert config_of(old) == replace(config, help_by="all", adaptive_sampling=0.0)
+    assert config_of(old, kind=StagedPerpetual) == replace(config, help_by="all", adaptive_sampling=0.0)
     stages = StageTrainer(begin(tmp_path, library(), config), tmp_path, until, 1, tensorboard=False)
     plain: Callable[[], dict[str, Tensor]] = stages.env.help.state
     monkeypatch.setattr(stages.env.help, "state", lambda: {"help": plain()["help"][:4]})

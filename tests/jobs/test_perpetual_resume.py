@@ -158,7 +158,7 @@ def test_a_finished_run_goes_on_with_more_time(tmp_path: Path) -> None:
 def test_settings_for_additive_actions() -> None:
     config = StagedPerpetual.additive(single=True, num_envs=8)
     assert (config.action, config.style, config.single, config.num_envs) == ("additive", None, True, 8)
-    assert config.ppo.std == 0.055 and config_of(to_data(config)) == config
+    assert config.ppo.std == 0.055 and config_of(to_data(config), kind=StagedPerpetual) == config
 
 
 def test_settings_survive_json() -> None:
