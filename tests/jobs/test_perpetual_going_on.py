@@ -172,7 +172,7 @@ def test_a_policy_goes_on_while_it_is_pushed_and_sees_its_goal_give_way(
         yielding is not None and 0.1 <= float(yielding.level.min()) < float(yielding.level.max()) <= 0.2
     )
     assert len(yielding.level.unique()) > 1 and bool(yielding.goal.offset.any())
-    seen = env.observe()[:, -columns:]
+    seen = env.observe()[:, env.columns["yielding"]]
     torch.testing.assert_close(seen[:, 0], yielding.level.float())
     torch.testing.assert_close(seen[:, 4:], yielding.goal.offset[:, 6:].float())
     stages.save()
