@@ -98,7 +98,7 @@ def test_poses_become_a_motion(tmp_path: Path, capsys) -> None:
     how = {"adapt": 0, "lookahead": FEW, "threads": 1, "controller": "lookahead"}
     done = complete(three, (0, 1, 2), tracker, times=(0.0, 1.0, 2.0), **how)
     assert done.at == (0, 30, 60) and done.keyframes == (0, 1, 2)
-    assert not done.tracked.failures and np.mean(done.met_mm) < 150
+    assert not done.failures and np.mean(done.met_mm) < 150
     with refused("keyframe-misplaced", says="9"):
         complete(three, (0, 1, 2), tracker, partial=(Partial(9),), **how)
     file = tmp_path / "poses.bvh"
@@ -125,7 +125,7 @@ def test_what_is_known_in_part_is_minded() -> None:
     goal = np.array([t.point for t in Partial(frame).touches(source)])
 
     def off(done) -> float:
-        there = np.array([t.point for t in Partial(frame).touches(done.tracked.delivered(hold=False))])
+        there = np.array([t.point for t in Partial(frame).touches(done.delivered(hold=False))])
         return float(np.linalg.norm(there - goal, axis=-1).mean())
 
     assert off(known) < off(plain)
