@@ -497,12 +497,12 @@ def completed(places: Places, unit: str) -> Any:
     done = complete(
         clip, keys, open_run(None).tracker, threads=1, supports="none", retime=retime, times=times
     )
-    made = done.filled.clip.positions()[list(done.at)]
+    made = done.filled.clips[0].positions()[list(done.at)]
     # The null: what the body is from its keyframes if it stays on the first one.
     still = np.linalg.norm(clip.positions()[keys] - clip.positions()[keys[:1]], axis=-1).mean()
     return {
         "keyframes": len(keys), "keyframes_met_mm": float(np.mean(done.met_mm)),
-        "worst_keyframe_mm": max(done.met_mm), "whole": float(not done.tracked.failures),
+        "worst_keyframe_mm": max(done.met_mm), "whole": float(not done.failures),
         "kept_exactly": float(np.abs(made - clip.positions()[keys]).max() < 1e-6),
         "core_s": time.process_time() - begun, "standing_still_mm": 1000 * float(still)
     }  # fmt: skip

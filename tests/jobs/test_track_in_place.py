@@ -109,6 +109,7 @@ def test_touch_points_travel_with_the_clip(loop: Clip) -> None:
 def test_keyframes_of_a_clip_in_place_are_completed_in_place(tracker: Tracker, loop: Clip) -> None:
     done = complete(loop, (0, 15, 30), tracker, controller="policy", adapt=0)
     assert stays(done.clip) and done.clip.frames == loop.frames
-    way = done.source.root_pos[-1] - done.source.root_pos[0]
+    assert done.travel is not None
+    way = done.travel.clip.root_pos[-1] - done.travel.clip.root_pos[0]
     assert float(np.linalg.norm(way[:2])) == pytest.approx(SPEED, rel=0.05)
     assert any("in place" in n for n in done.notes)

@@ -12,6 +12,7 @@ from poise.env.evaluate import seen_by
 from poise.env.stream import StreamGoal
 from poise.learn import PPOConfig
 from poise.motion.rotations import axis_angle_to_quat, lateral_heading, quat_mul
+from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import Perpetual, config_of
@@ -45,7 +46,7 @@ def test_settings_of_before_mean_the_twist_and_nothing_new() -> None:
     for name in ("heading", "window", "filter", "root", *prices):
         del old[name]
     assert config_of(old) == Perpetual(heading="twist") != Perpetual()
-    assert Perpetual.paper().heading == Perpetual.code().heading == "twist"
+    assert StagedPerpetual.paper().heading == StagedPerpetual.code().heading == "twist"
     assert config_of(to_data(Perpetual(window=(2, 4, 8)))).window == (2, 4, 8)
 
 

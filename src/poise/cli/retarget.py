@@ -54,7 +54,7 @@ def run(
     say(f"{made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
     # Both files' guesses (unit, vertical, ...) decide what is written.
     guessed = [*source.skeleton.source.notes]
-    guessed += [f"{target.name}: {n}" for n in target.skeleton.source.notes]
+    guessed += [f"{onto.name}: {n}" for n in target.skeleton.source.notes]
     said = [*guessed, *cleaned.noise_sentences(), *report.sentences()]
     return Answer(report.to_dict(), {"clip": out}, said)
 

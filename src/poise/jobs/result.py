@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from poise.recipes.imitation import Imitation
     from poise.score.report import Report
     from poise.synthesis.inbetween import FilledClips, Retiming
+    from poise.synthesis.rounds import GapFault
 
 #: What a result does not have, where its type says that others do.
 ABSENT: Any = None
@@ -217,6 +218,16 @@ class Result:
     def clip(self) -> Clip:
         """The first of them: the motion of the first character or clip, or the best guess."""
         return self.clips[0]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is said of motion between keyframes."""
+        return () if self.filled is ABSENT else self.filled.warnings
+
+    @property
+    def faults(self) -> tuple[GapFault, ...]:
+        """What the doctor finds between keyframes after all that was tried."""
+        return () if self.filled is ABSENT else self.filled.faults
 
     @property
     def sentence(self) -> str:
