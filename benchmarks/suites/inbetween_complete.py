@@ -543,7 +543,7 @@ def fastest(places: Places, unit: str) -> Any:
     fast = [
         np.linalg.norm(np.diff(c.positions(), axis=0), axis=-1).max() * c.fps for c in (clip, made.clip)
     ]
-    return [max(made.over), float(fast[1] / fast[0])]
+    return [max(made.filled.over), float(fast[1] / fast[0])]
 
 
 def fastest_rows(places: Places, raws: Raws) -> Iterator[Figure]:

@@ -491,11 +491,11 @@ def buffered(places: Places, unit: str, policy: str) -> Any:
     live, lines = streams(places, policy)
     length, noise = (float(x) for x in re.findall(r"[\d.]+", unit))
     live.aims.noise, live.aims.rng = noise, np.random.default_rng(0)
-    live.people.delay(length / 1000)
+    live.aims.people.delay(length / 1000)
     live.aims.set_lead()
     came, many = (
         list[tuple[bool, float]](),
-        live.world.size if hasattr(live.world, "size") else len(live.world.characters),
+        len(live.world.characters),
     )
     for first in range(0, len(lines), many):
         part = lines[first : first + many]
