@@ -316,7 +316,7 @@ def moved(packet: Packet, k: int) -> Packet:
 
 def streamed(live: Live, lines: list[Sent]) -> list[tuple[bool, float]]:
     """Whether each clip is done to its end, and its mean error, mm; as many as there are characters."""
-    rate, world, people = live.rate_hz, live.world, live.people
+    rate, world, people = live.rate_hz, live.world, live.aims.people
     people.known.clear()
     people.follows[:] = [f"c{k}" for k in range(len(lines))]
     live.aims.read_s = None
