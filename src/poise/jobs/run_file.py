@@ -229,10 +229,12 @@ def held_run(
 
 
 def _as_known(clips: Sequence[Mapping[str, Any]], library: ClipLibrary) -> list[dict[str, Any]]:
-    """The library packed as `clips` are: a run of an older version knew fewer fields of a source."""
+    """The library packed as `clips` are: a run of an older version knew fewer fields of a source, and a
+    file may have been moved since."""
     here: list[dict[str, Any]] = json.loads(json.dumps(pack_clips(library.clips)[1]))
     for old, new in zip(clips, here, strict=False):
         new["source"] = {k: v for k, v in new["source"].items() if k in old["source"]}
+        new["source"] |= {k: v for k, v in old["source"].items() if k == "path"}
     return here
 
 
