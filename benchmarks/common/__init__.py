@@ -1,1 +1,1 @@
-"""What suites share: sets of clips, policies, rows, rules of success, starts, the runner."""
+"""Parts that suites share: sets of clips, policies, rows, rules of success, starts, the runner."""

@@ -93,7 +93,7 @@ SINGLE: dict[str, tuple[str, str | None, float | None, str]] = {
 
 @dataclass(frozen=True)
 class Places:
-    """Where clips lie.
+    """Folders of the clips.
 
     Attributes:
         data: the development set with its `INDEX.tsv`. library: the training library of

@@ -39,7 +39,7 @@ Episode = dict[str, Any]
 
 
 def episodes(r: RolloutSet, trial: int = 0) -> list[Episode]:
-    """What each episode came to: success by rule, frames until PHC's rule broke, sums of the errors."""
+    """The end of each episode: success by rule, frames until PHC's rule broke, sums of the errors."""
     judged = judge(r, success_rule("phc"))
     mask, uncut = judged.mask.clone(), judged.uncut.clone()
     mask[:, 0] = uncut[:, 0] = False

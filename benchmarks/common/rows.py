@@ -15,7 +15,7 @@ from poise.learn.checkpoint import write_atomic
 
 
 class Figure(NamedTuple):
-    """What a suite found.
+    """A row of a table of results.
 
     Attributes:
         spread: of the value, as text; "" for none. n: how many were measured. seeds: how many draws.

@@ -108,7 +108,7 @@ def command_of(suite: str, part: str) -> str:
 
 @dataclass
 class Store:
-    """What units gave, in a file that grows line by line."""
+    """Results of units, in a file that grows line by line."""
 
     path: Path
     made_with: str
@@ -163,7 +163,7 @@ def measured(suite: str, part: str, unit: str, places: Places) -> tuple[Any, flo
 
 
 def missing(part: Part, places: Places) -> str:
-    """What a part lacks here; "" for nothing."""
+    """The thing that a part lacks here; "" for nothing."""
     packages = [n for n in part.needs if n not in ("data", "library", "gpu")]
     if not places.smoke:
         if "data" in part.needs and not (places.data / "INDEX.tsv").exists():

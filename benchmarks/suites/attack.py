@@ -1,4 +1,4 @@
-"""What comes of hostile files, and of trainings that are killed: one sentence, what time, what memory.
+"""Hostile files, and of trainings that are killed: one sentence, what time, what memory.
 
 Every file is made in `tests/fuzz/hostile.py` by a few lines and read in a process of its own, which is
 stopped after three minutes of processor time or at 6 GB. `ok` says that it was read or refused in one
@@ -179,7 +179,7 @@ def finished(argv: list[str], log: Path, within: float) -> float:
 
 
 def end_of(out: Path) -> dict[str, Any]:
-    """What a run has left, by file; without clocks."""
+    """Results of a run, by file; without clocks."""
     ends: dict[str, Any] = {}
     for path in sorted(p for p in out.rglob("*") if p.is_file()):
         name = str(path.relative_to(out))
@@ -214,7 +214,7 @@ def timeless(data: Any) -> Any:
 
 
 def differences(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
-    """What two ends do not have in common."""
+    """Differences of two ends: all that they do not have in common."""
     return sorted(k for k in a.keys() | b.keys() if a.get(k) != b.get(k))
 
 
@@ -281,7 +281,7 @@ def files_of(places: Places) -> list[str]:
 
 
 def attacked(places: Places, unit: str) -> Any:
-    """What comes of one."""
+    """The outcome of one."""
     return outcome(unit)
 
 

@@ -98,7 +98,7 @@ AFTER_S = 15.0
 
 @dataclass
 class Rollouts:
-    """What worlds did.
+    """Motion of worlds.
 
     Attributes:
         done, asked: `(N, T, 7 + n)`, as it was simulated, and the goals; only `count` frames are there.
@@ -233,7 +233,7 @@ def figures_of(qpos: np.ndarray) -> dict[str, Any]:
 
 
 def went(made: Rollouts, world: int, seconds: float, recover: bool = True) -> dict[str, Any]:
-    """What one rollout is worth."""
+    """Figures of one rollout."""
     tracker, model, generator = loaded()
     fps, humanoid = generator.fps, tracker.humanoid
     falls, away, down = made.of(world)

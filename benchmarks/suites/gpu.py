@@ -1,4 +1,4 @@
-"""What an NVIDIA GPU gives: stepping beside mujoco_warp's own captured step, the tracker's training,
+"""Speed of an NVIDIA GPU: stepping beside mujoco_warp's own captured step, the tracker's training,
 labels.
 
 Each part takes less than 9 minutes: what the clock stops goes on with the next command. In a smoke test
@@ -294,7 +294,7 @@ WORLDS = 4096
 
 
 def device_of(places: Places) -> str:
-    """Where it is measured."""
+    """The machine that is measured."""
     return "cpu" if places.smoke else "cuda"
 
 
@@ -344,7 +344,7 @@ def stepping_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 
 
 def sides(places: Places) -> list[str]:
-    """Where physics and networks are."""
+    """The device of physics and networks."""
     here = device_of(places)
     pairs = [("cpu", here), ("cpu", "cpu")] + ([(here, here)] if warp_is_there() else [])
     return [

@@ -115,7 +115,7 @@ _LENGTH = 30
 
 
 def known_of(test: TestSet, length: int) -> Known:
-    """What a network sees, float32."""
+    """Inputs of a network, float32."""
     return Known(*(x.float() for x in test.known(length)))
 
 

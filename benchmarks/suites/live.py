@@ -63,7 +63,7 @@ def serve(*argv: str) -> tuple[subprocess.Popen[str], str]:
 
 
 def memory_mb(pid: int) -> float:
-    """What a process holds."""
+    """The memory of a process."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
@@ -74,7 +74,7 @@ STANDS_S = 3.0
 
 @dataclass
 class Told:
-    """What was sent, by kind."""
+    """Packets that were sent, by kind."""
 
     counts: dict[str, int] = field(default_factory=dict)
 
@@ -170,7 +170,7 @@ WARMS_S, ENDS_S = 10.0, 20.0
 
 
 def told(seen: Sequence[tuple[float, dict[str, Any]]], sent: Told, warms_s: float) -> dict[str, Any]:
-    """What figures `(s, figures)` of a run say."""
+    """Rows of the figures `(s, figures)` of a run."""
     counted = [(t, s) for t, s in seen if t > warms_s]
     if not counted:
         return {}
@@ -285,7 +285,7 @@ class Sent(NamedTuple):
 
 
 def sent(clip: Clip, tracker: Tracker, seed: int) -> Sent:
-    """What a source sends of a clip."""
+    """Packets of a source for a clip."""
     rng, rate = np.random.default_rng(seed), clip.fps
     packets = [
         Packet("x", k / rate, clip.skeleton, clip.root_pos[k], clip.rot[k], clip)

@@ -54,7 +54,7 @@ SMALL = LookaheadConfig(candidates=10, horizon=4)
 
 @dataclass(frozen=True)
 class Condition:
-    """What goes wrong.
+    """Faults of an episode.
 
     mass, friction, gains: factors of the planner's model; the world stays as it is. push_n: N, on the
     upper trunk, in a horizontal direction that is drawn for each push. noise: strength of a video

@@ -265,7 +265,7 @@ def network(motions: Motions, name: str, seed: int, steps: int) -> Trained:
 
 
 def continued(made: MotionGenerator, pasts: Tensor, frames: int, seed: int) -> Tensor:
-    """What follows pasts `(N, p, 7 + n)`, segment after segment `(N, frames, 7 + n)`."""
+    """Motion that follows pasts `(N, p, 7 + n)`, segment after segment `(N, frames, 7 + n)`."""
     rng, parts, have = torch.Generator().manual_seed(seed), [pasts], 0
     ids = torch.arange(len(pasts))
     while have < frames:
@@ -407,7 +407,7 @@ def _imitation(tracker: Tracker, reference: Reference, config: Any, own: Any) ->
 
 
 class Done(NamedTuple):
-    """What characters did `(N, f, 7 + n)`, and the mean help, N and N m."""
+    """Motion of characters `(N, f, 7 + n)`, and the mean help, N and N m."""
 
     qpos: Tensor
     force: float
@@ -478,7 +478,7 @@ OF_A_CLASS = ("ours", "ERD", "acLSTM")
 
 
 class Unit(NamedTuple):
-    """What the rows of one model of one seed share."""
+    """Fields that the rows of one model of one seed share."""
 
     library: str
     model: str

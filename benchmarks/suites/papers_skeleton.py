@@ -179,7 +179,7 @@ LOOKS = "base + TTA + universal policy with lookahead"
 
 
 class Bench(NamedTuple):
-    """What the rows of a length share."""
+    """Fields that the rows of a length share."""
 
     test: Set
     adapted: list[Clip]

@@ -120,7 +120,7 @@ def look(data: Path, row: dict[str, str]) -> dict[str, Any]:
 
 
 def _wrong(row: dict[str, str], group: Group, facts: dict[str, Any]) -> list[str]:
-    """What was recognised otherwise than the truth says."""
+    """Guesses that differ from the truth."""
     out = []
     if group.unit is not None and abs(facts["unit_m"] / group.unit - 1) > UNIT_SLACK:
         out.append(f"unit {facts['unit_m']:.4g} m instead of {group.unit:.4g}")

@@ -123,7 +123,7 @@ def policy() -> Tracker:
 
 
 def stiff_units(places: Places) -> list[str]:
-    """What is commanded, and how."""
+    """A command, and how it is given."""
     if places.smoke:
         return ["law off", "commanded 160 N/m"]
     return ["law off", *(f"commanded {k:g} N/m" for k in COMMANDS), *(f"level {a:g}" for a in LEVELS)]
@@ -323,7 +323,7 @@ def cost_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 
 
 def costs(places: Places, unit: str) -> Any:
-    """What compliance costs."""
+    """The time that compliance costs."""
     return cost(policy(), *((8, 2, 1) if places.smoke else (ROWS, STEPS, REPEATS)))
 
 

@@ -109,7 +109,7 @@ def estimated(places: Places, unit: str) -> Any:
 
 
 def noisy(places: Places, unit: str) -> Any:
-    """What is left of a clip's success at each strength of a video estimator's errors."""
+    """A clip's success at each strength of a video estimator's errors."""
     strengths = STRENGTHS[:2] if places.smoke else STRENGTHS
     levels = robustness_levels(strengths=strengths)
     return robustness(policy_of("tracker"), [clip_of(places, "bandai", unit)], levels).to_dict()["rungs"]

@@ -58,6 +58,7 @@ def run(
     if not 0 <= adapt <= 1000:
         raise PoiseError(f"--adapt must be 0 to 1000, got {adapt}", code="out-of-range")
     check_range("samples", samples, 1, 100)
+    check_range("seed", seed, 0)
     one = samples == 1
     outs = [out] if one else [out.with_stem(f"{out.stem}-{k}") for k in range(samples)]
     check_writable(outs[0])

@@ -157,7 +157,7 @@ Texts: TypeAlias = UseAppendAction[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Directing:
-    """What a director wants of a motion, and how well it is looked for."""
+    """A director's wishes for a motion, and how well it is looked for."""
 
     weight: Annotated[Texts, arg(metavar="PART=FACTOR[:A-B]")] = ()
     """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
@@ -174,7 +174,7 @@ class Directing:
     More are nearer and cleaner, and take longer."""
 
     def values(self) -> dict[str, Any]:
-        """What is stated, as settings of `TrackConfig`.
+        """The wishes, as settings of `TrackConfig`.
 
         Raises:
             PoiseError: words that make no sense.

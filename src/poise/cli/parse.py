@@ -33,7 +33,7 @@ _KINDS = {"INT": "a whole number", "FLOAT": "a number"}
 
 
 def parse(options: Callable[..., T], argv: Sequence[str], prog: str, default: Any = None) -> T:
-    """What `argv` states of the options of a verb, see `options_of`.
+    """The options of a verb that `argv` states, see `options_of`.
 
     Args:
         default: what is not stated, where that differs from the class's.

@@ -87,9 +87,14 @@ def run(
 
     with named_options("TrackConfig"):
         config = TrackConfig(
-            seed=seed, controller=controller, threads=threads, body=body, push=push,
-            smooth_hz=reading.smooth, in_place=in_place,
-        )  # fmt: skip
+            seed=seed,
+            controller=controller,
+            threads=threads,
+            body=body,
+            push=push,
+            smooth_hz=reading.smooth,
+            in_place=in_place,
+        )
     source = reading.read(clip)
     with working("opening the policy"):
         tracker = open_run(policy).tracker

@@ -91,7 +91,7 @@ def texts_of(doc: str | None, known: Iterable[str]) -> dict[str, str]:
 
 
 def _texts(kind: type) -> dict[str, str]:
-    """What the docstrings of a dataclass and of those that it extends say of its fields."""
+    """The texts of a dataclass's fields, from its docstring and from those that it extends."""
     names, out = [f.name for f in fields(kind)], dict[str, str]()
     for owner in kind.__mro__[-2::-1]:
         out |= texts_of(owner.__doc__, names)

@@ -74,7 +74,7 @@ class EpisodeStart:
 
 @dataclass(eq=False)
 class StepOutcome:
-    """What became of the episodes in one control step; events note or change it in place.
+    """The ends of episodes in one control step; events note or change it in place.
 
     Attributes:
         ends: `(3, N)` bool: failed, terminated, truncated.
@@ -104,7 +104,7 @@ class StepOutcome:
 
     @cached_property
     def bins(self) -> Outcomes:
-        """What the step says of the clips' motion bins."""
+        """Figures of the step for the clips' motion bins."""
         failed, terminated = self.ends[0], self.ends[1]
         assert self.row is not None
         bins = self.goal.clips.reference.bins
@@ -121,7 +121,7 @@ class Event(State):
     """
 
     def tells(self) -> Mapping[str, Tensor | Observable]:
-        """What terms can ask a frame for, by name: tensors `(N, ...)`, the same ones at every step, for
+        """Values of a frame by name, for terms: tensors `(N, ...)`, the same ones at every step, for
         `Frame.source`, and observables, which come before those of `env.frame`."""
         return {}
 

@@ -430,7 +430,7 @@ def linvel_before(frame: Frame) -> Tensor:
 
 
 def point(frame: Frame) -> PointGoal | None:
-    """Where the reference's root is; the recovery event says it."""
+    """The place of the reference's root, from the recovery event."""
     return None
 
 

@@ -63,7 +63,7 @@ class End(NamedTuple):
 
 
 def ends_on(sim: SceneSim, rows: CharacterRows, name: str) -> list[End]:
-    """Where a touch or a measured link acts on the characters of some rows.
+    """The places at which a touch or a measured link acts on the characters of some rows.
 
     Raises:
         PoiseError: there is none, it is on a whole character, or on none of these.
@@ -210,7 +210,7 @@ class ScenePart(Force):
             episodes.seeing = (torch.unique(ids // k).unsqueeze(1) * k + others).flatten()
 
     def before_step(self, drive: Drive) -> bool:
-        """What happens before the control step; metered physics steps are made one by one."""
+        """Events before the control step; metered physics steps are made one by one."""
         for event in self.events:
             event.before_step(drive)
         self._fresh = True
@@ -295,7 +295,7 @@ class ScenePart(Force):
             self._share(f"touch/{name}", torch.cat(numbers, 1))
 
     def _share(self, name: str, value: Tensor) -> None:
-        """What all characters of a world see, `(N, ...)`."""
+        """Values that all characters of a world see, `(N, ...)`."""
         self._keep(name, value.repeat_interleave(self._many, 0) if self._many > 1 else value)
 
     def _keep(self, name: str, value: Tensor) -> None:

@@ -181,7 +181,7 @@ def still(
     tracks: Mapping[str, np.ndarray], fps: float
 ) -> tuple[dict[str, np.ndarray], RemovedTremble | None]:
     """The tracks `(T, 3)` m of the places of a body without their noise, and what it was; None where
-    there is none, and the tracks as they are. What is long is told and smoothed by pieces.
+    there is none, and the tracks as they are. A long recording is told and smoothed by pieces.
 
     Noise is told as that of joints is (`motion.smoothing.Spectrum`), and by the bones: they keep their
     lengths when a body moves, whatever it does, and do not when each keypoint trembles by itself.

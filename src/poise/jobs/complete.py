@@ -155,8 +155,10 @@ def complete(
             filled.clip, tracker, replace(how, direction=direction), progress=progress, warn=warn
         )
         made = {
-            "filled": filled.clip, "simulated": tracked.delivered(hold=False), "delivered": tracked.clip,
-        }  # fmt: skip
+            "filled": filled.clip,
+            "simulated": tracked.delivered(hold=False),
+            "delivered": tracked.clip,
+        }
         off = {name: key_errors(clip, source, keys, at) for name, clip in made.items()}
         told_times = None
         if not (factors == 1.0).all():

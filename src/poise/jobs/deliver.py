@@ -34,7 +34,7 @@ ROUGHER, AROUND_S, ROUNDS = 1.25, 0.5, 3
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What a policy did: the score card, the padded rollouts, one whole episode per clip.
+    """A policy's episodes: the score card, the padded rollouts, one whole episode per clip.
 
     together: whether these are characters of one world.
     """

@@ -120,7 +120,7 @@ def _steps(value: float, step: float) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result:
-    """What a verb made of a motion. What it does not make, or was not asked for, is None or empty.
+    """The outcome of a verb. Fields that it does not fill, or nobody asked for, are None or empty.
 
     Attributes:
         imitation, evaluation: the motion on its body as a task; score card, rollouts and episodes.
@@ -186,7 +186,7 @@ class Result:
 
     @property
     def source(self) -> Clip:
-        """What came in, as what is written compares with it."""
+        """The motion that came in, with which the written one is compared."""
         if self.came is not ABSENT:
             return self.came
         if self.travel is not None:
@@ -221,26 +221,26 @@ class Result:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is said of motion between keyframes."""
+        """Sentences on motion between keyframes."""
         return () if self.filled is ABSENT else self.filled.warnings
 
     @property
     def faults(self) -> tuple[GapFault, ...]:
-        """What the doctor finds between keyframes after all that was tried."""
+        """Faults that the doctor finds between keyframes after all that was tried."""
         return () if self.filled is ABSENT else self.filled.faults
 
     @property
     def sentence(self) -> str:
-        """What became of the motion."""
+        """A sentence on how the motion ended."""
         return self.said[0] if self.said else story(self, hint=False).sentence
 
     @cached_property
     def finished(self) -> Delivery:
-        """What is written, standing feet held: made once, for the card and for the files."""
+        """The motions to write, standing feet held: made once, for the card and for the files."""
         return self.as_written(True)
 
     def as_written(self, hold: bool) -> Delivery:
-        """What is written, a clip in place as it came. hold: standing feet are held."""
+        """The motions to write, a clip in place as it came. hold: standing feet are held."""
         if self.evaluation is ABSENT:
             many = len(self.filled.clips) > 1
             clips = {f"filled-{k}" if many else "filled": c for k, c in enumerate(self.filled.clips)}
@@ -399,7 +399,7 @@ def clip_of(motion: Clip | str | Path) -> Clip:
 
 
 def needs_of(imitation: Imitation, supports: Sequence[Support] = ()) -> tuple[Need, ...]:
-    """What a task's first motion needs besides a floor and its supports."""
+    """Needs of a task's first motion besides a floor and its supports."""
     reference = imitation.reference
     frames = int(reference.length[0])
     pose = reference.pose
@@ -433,7 +433,7 @@ Word = Literal["tracked", "found", "came back", "not tracked", "lost"]
 
 
 class Story(NamedTuple):
-    """What became of a motion.
+    """How a motion ended.
 
     Attributes:
         word: in a word or two, as `outcome` in JSON.
@@ -450,7 +450,7 @@ class Story(NamedTuple):
 
 
 def story(tracked: Result, reset: bool = False, hint: bool = True) -> Story:
-    """What became of a motion, or of several.
+    """How a motion, or several, ended.
 
     reset: whether a character that failed was put back. hint: whether the option that does so is named.
     """
@@ -480,7 +480,7 @@ def story(tracked: Result, reset: bool = False, hint: bool = True) -> Story:
 
 
 def helped(card: ScoreCard) -> str:
-    """What helped, in newtons and as a share of body weight: "without help"."""
+    """The help, in newtons and as a share of body weight: "without help"."""
     aid = card.help
     if not aid.force_mean_n and not aid.torque_mean_nm:
         return "without help"

@@ -121,8 +121,8 @@ def _moved(path: Tensor) -> float:
 
 
 def _when(middle: float, busy: Tensor, length: int, later: int) -> int:
-    """Where a step of `length` frames begins: with little of it while other feet are in the air (`busy`
-    `(T)`), room after it for `later` more steps, then near `middle`."""
+    """The frame in which a step of `length` frames begins: with little of it while other feet are in
+    the air (`busy (T)`), room after it for `later` more steps, then near `middle`."""
     frames = len(busy)
     last = max(_EDGE_FRAMES, frames - _EDGE_FRAMES - (later + 1) * length)
     starts = torch.arange(_EDGE_FRAMES, last + 1)
@@ -149,7 +149,8 @@ class Swing(NamedTuple):
 def planned(
     ways: Sequence[float], up: Tensor, seconds: float, first: int, more: tuple[int, int] = (0, 0)
 ) -> tuple[Swing, ...] | None:
-    """Which foot swings when, as few steps as there may be; None where two feet cannot walk it.
+    """The foot of each step and its time, as few steps as there may be; None where two feet cannot walk
+    it.
 
     Args:
         ways: m that either foot must go. up: `(2, 2)` bool, in the air in either keyframe, by foot.
@@ -214,9 +215,13 @@ SOLE_M = 0.14
 
 
 def planted(
-    skeleton: Skeleton, motion: Motion, off_floor: tuple[bool, bool], lean: Tensor,
-    falls: tuple[float, float], fps: float,
-) -> Motion:  # fmt: skip
+    skeleton: Skeleton,
+    motion: Motion,
+    off_floor: tuple[bool, bool],
+    lean: Tensor,
+    falls: tuple[float, float],
+    fps: float,
+) -> Motion:
     """A gap with its keyframes, from one that stands to one in the air or back: the trunk leans, before
     the flight each foot is where the keyframe has it, and legs bend to follow.
 
@@ -267,7 +272,7 @@ def planted(
 def _leaves(
     ankle: Tensor, quat: Tensor, root: Tensor, sole: Tensor, fall: float, fps: float
 ) -> tuple[Tensor, Tensor]:
-    """Where an ankle is and how it is turned, `(T, 3)` and `(T, 4)`, standing in the first frame, with
+    """An ankle's place and rotation, `(T, 3)` and `(T, 4)`, standing in the first frame, with
     its toes at `sole (3,)` m from it, and in the air for the last `fall` s."""
     frames = len(ankle)
     t = (torch.arange(frames, dtype=ankle.dtype) - (frames - 1)) / fps + fall

@@ -1,4 +1,4 @@
-"""Where characters go: a recording, on disk within a second, and avatar tools that take VMC."""
+"""Outputs of characters: a recording, on disk within a second, and avatar tools that take VMC."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CharacterRecorder:
     """Records characters of one body.
 
     Each goes into a CSV of Poise's own, NAME-1.csv for the first of several, which a file of the suffix
-    that was asked for replaces at the end. What a crash leaves is that CSV, which `poise convert` reads.
+    that was asked for replaces at the end. A crash leaves that CSV, which `poise convert` reads.
 
     Args:
         path: of the motion, .bvh, .glb, .csv or another that is written.
@@ -210,10 +210,10 @@ class Puppet:
 class OwnPuppet:
     """The simulated body on the model of the person that it follows.
 
-    What came in goes out, turned by what the simulated body differs from its goal: with no difference
-    it is what came, to the last digit, whatever a body's hinges cannot do. Each bone's rotation is
-    P_sim K with K = P_goal^-1 R, R being the person's and P the puppet's; while the character follows
-    something else K fades to none.
+    The pose that came in goes out, turned by what the simulated body differs from its goal: with no
+    difference it is what came, to the last digit, whatever a body's hinges cannot do. Each bone's
+    rotation is P_sim K with K = P_goal^-1 R, R being the person's and P the puppet's; while the character
+    follows something else K fades to none.
 
     Args:
         table: the body.

@@ -59,7 +59,7 @@ class Targets:
         self.set_lead()
 
     def next(self, now_s: float) -> tuple[Tensor, Tensor | None, tuple[Own | None, ...]]:
-        """What characters are to do in the control step at `now_s`.
+        """The poses that characters are to take in the control step at `now_s`.
 
         Returns:
             frames: `(K, 7 + n)`, the newest that the goals know.

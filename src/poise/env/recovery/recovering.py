@@ -191,7 +191,7 @@ class Recovering(Goal):
         )
 
     def _told(self, packed: Tensor, ids: Tensor | None, k: int) -> Tensor:
-        """What the goal tells of k steps later, and the recovery motions where worlds are on them."""
+        """The goal k steps later, and the recovery motions where worlds are on them."""
         rows, which = self._rows(ids, k)
         return packed.index_copy(0, rows, self._packed[which]) if len(rows) else packed
 

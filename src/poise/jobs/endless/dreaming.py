@@ -167,9 +167,14 @@ def names_of(out: Path, count: int) -> list[Path]:
 
 
 def _go_about(
-    tracker: Tracker, made: Kinematic, config: Dream, pasts: Tensor, steps: int, seen: _Seen,
+    tracker: Tracker,
+    made: Kinematic,
+    config: Dream,
+    pasts: Tensor,
+    steps: int,
+    seen: _Seen,
     notes: list[str],
-) -> Recovering:  # fmt: skip
+) -> Recovering:
     """Simulates until all steps are made or `seen` has seen enough; the goal that was followed."""
     steering = Steering(config.targets, config.count > 1)
 

@@ -277,7 +277,7 @@ class Dreamt(Result):
 
     @property
     def source(self) -> Clip:
-        """What the kinematic policy made for the first character, in the same frames."""
+        """The kinematic policy's motion for the first character, in the same frames."""
         return self.body.clip(self.characters[0].asked.read(), "asked")
 
     def as_written(self, hold: bool) -> Delivery:

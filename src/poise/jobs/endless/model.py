@@ -230,7 +230,7 @@ def kinds_of(clips: Sequence[str], labels: Sequence[Label]) -> Tensor:
 
 
 def clips_of_seeds(motions: Motions, past: int) -> Tensor:
-    """Which clip each of `motions.seeds` is of, `(S,)`; as `endless_training.motions_of` picks them."""
+    """The clip of each of `motions.seeds`, `(S,)`; as `endless_training.motions_of` picks them."""
     sizes = torch.diff(motions.frames.first).tolist()
     clips = [c for c, n in enumerate(sizes) for _ in range(0, n - past, past)]
     return torch.tensor(clips)[spread(len(clips), len(motions.seeds))]

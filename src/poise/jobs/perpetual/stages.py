@@ -78,7 +78,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Progress:
-    """What one iteration came to.
+    """Figures of one iteration.
 
     Attributes:
         stage: the one that was trained.
@@ -136,7 +136,7 @@ def demonstrations(imitation: Imitation) -> Reference:
 
 
 def practised(imitation: Imitation, stage: Stage) -> Imitation:
-    """What a stage's characters practise: the library, in a stage that recovers with recovery motions
+    """The task of a stage's characters: the library, in a stage that recovers with recovery motions
     besides, and in the stage of the recovery primitive recovery motions alone."""
     if imitation.recovery_clips is None or stage.recovers is None:
         return imitation
@@ -217,7 +217,7 @@ class StageOrder:
 
     @property
     def first(self) -> Stage:
-        """What a run begins with."""
+        """The first stage of a run."""
         return Stage("single")
 
     def lasts(self, stage: Stage) -> bool:
@@ -225,7 +225,7 @@ class StageOrder:
         return stage.mixed or not self.config.recovery
 
     def following(self, stage: Stage, fails: bool) -> Stage | None:
-        """What comes after a stage; None ends the training.
+        """The stage after this one; None ends the training.
 
         fails: whether a clip failed that one primitive more could learn.
         """
@@ -331,10 +331,16 @@ class StageOrder:
         return self.config.clone or clone_for(int(imitation.reference.length.sum()), worlds)
 
     def next(
-        self, before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
-        dumps: Path | None, tell: TrainingCallbacks,
-    ) -> WarmStart:  # fmt: skip
-        """What a later stage starts from.
+        self,
+        before: WarmStart,
+        imitation: Imitation,
+        stage: Stage,
+        owner: Tensor,
+        threads: int,
+        dumps: Path | None,
+        tell: TrainingCallbacks,
+    ) -> WarmStart:
+        """The policy that a later stage starts from.
 
         Args:
             before: what the last stage learned, with its critic, which goes on.
@@ -352,9 +358,15 @@ class StageOrder:
         return replace(own, config=replace(own.config, ppo=self.ppo(stage)))
 
     def trainer(
-        self, imitation: Imitation, stage: Stage, start: WarmStart | None, warm: bool, threads: int,
-        dumps: Path | None, device: str,
-    ) -> Trainer:  # fmt: skip
+        self,
+        imitation: Imitation,
+        stage: Stage,
+        start: WarmStart | None,
+        warm: bool,
+        threads: int,
+        dumps: Path | None,
+        device: str,
+    ) -> Trainer:
         """The stage's trainer on fresh worlds, with draws of its own.
 
         warm: whether `start` acts already, so that the critic learns first. How large its steps are the
@@ -376,7 +388,7 @@ class StageOrder:
 
 
 def order_of(config: Perpetual) -> StageOrder:
-    """What decides on the stages of a run with these settings."""
+    """The order of the stages of a run with these settings."""
     return imported(config.ORDER)(config)
 
 

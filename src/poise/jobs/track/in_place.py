@@ -74,7 +74,7 @@ class InPlace:
         return replace(direction, touches=tuple(out))
 
     def sentence(self) -> str:
-        """What was done, in words."""
+        """The travel in words."""
         told = f"{self.source.name} {self.travel.words()}: it is simulated with that travel"
         one = ""
         if self.overlap is not None:

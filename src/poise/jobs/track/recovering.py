@@ -293,7 +293,7 @@ Span = tuple[int | None, int | None]
 
 @dataclass(frozen=True)
 class ChainPart:
-    """What became of one of several clips; times are s of what came out.
+    """How one of several clips ended; times are s of what came out.
 
     Attributes:
         clip: its name.
@@ -316,7 +316,7 @@ class ChainPart:
         return self.ends is not None and (self.lost is None or self.came_back)
 
     def sentence(self) -> str:
-        """What became of it."""
+        """A sentence on how it ended."""
         if self.begins is None:
             return f"{self.clip}: not reached."
         reached = f"reached {self.after:.1f} s after the clip before, " if self.after else ""
@@ -366,7 +366,7 @@ def cut(r: RolloutSet, spans: Sequence[Span], reference: Reference) -> RolloutSe
 
 
 def parts_of(rollouts: RolloutSet, spans: Sequence[Span], rule: str, returns: bool) -> list[ChainPart]:
-    """What became of each clip.
+    """How each clip ended.
 
     rollouts: what `cut` gave. returns: whether the character comes back to a clip that it lost.
     """

@@ -217,7 +217,7 @@ def _same(session: TrackSession, result: Result) -> Result:
 
 @dataclass(frozen=True)
 class Feature:
-    """What may be done to a motion beside tracking it.
+    """A feature: something that may be done to a motion beside tracking it.
 
     Attributes:
         asked: whether a session asks for it.
@@ -278,7 +278,7 @@ def _place(s: TrackSession) -> None:
 
 
 def _support(s: TrackSession) -> None:
-    """What a single motion rests on."""
+    """Supports of a single motion."""
     s.supports, s.imitation = with_supports(s.imitation, s.config.supports, s.placed[0])
     s.notes += [one.sentence() for one in s.supports]
 

@@ -58,7 +58,7 @@ class Scale:
 
 
 class _Plan(NamedTuple):
-    """What turns each joint of a target, as rows of arrays.
+    """The source that turns each joint of a target, as rows of arrays.
 
     Attributes:
         direct: targets, and the joints of the source that move them.

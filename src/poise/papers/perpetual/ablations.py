@@ -103,10 +103,16 @@ class StagedPerpetual(Perpetual):
         from poise.learn import AmpConfig, MiningConfig
 
         own: dict[str, Any] = {
-            "faithful": "paper", "energy_form": "paper", "termination": "relaxed",
-            "style": AmpConfig.phc("paper"), "mining": MiningConfig.phc("paper"),
-            "start": "random", "lateral": True, "combine": "product", "weights": "softmax",
-        }  # fmt: skip
+            "faithful": "paper",
+            "energy_form": "paper",
+            "termination": "relaxed",
+            "style": AmpConfig.phc("paper"),
+            "mining": MiningConfig.phc("paper"),
+            "start": "random",
+            "lateral": True,
+            "combine": "product",
+            "weights": "softmax",
+        }
         return cls(**(_phc() | own | changes))
 
     @classmethod
@@ -121,15 +127,21 @@ class StagedPerpetual(Perpetual):
         from poise.learn import AmpConfig, MiningConfig
 
         own: dict[str, Any] = {
-            "faithful": "code", "energy_form": "code", "termination": "code",
-            "style": AmpConfig.phc("code"), "mining": MiningConfig.phc("code"),
-            "start": "copy", "lateral": False, "combine": "means", "weights": "relu",
-        }  # fmt: skip
+            "faithful": "code",
+            "energy_form": "code",
+            "termination": "code",
+            "style": AmpConfig.phc("code"),
+            "mining": MiningConfig.phc("code"),
+            "start": "copy",
+            "lateral": False,
+            "combine": "means",
+            "weights": "relu",
+        }
         return cls(**(_phc() | own | changes))
 
     @property
     def method(self) -> str:
-        """What a score card calls it."""
+        """Its name on a score card."""
         kinds = {"single": self.single, "plain": not self.multiplicative, "joint": not self.progressive}
         return "-".join(["perpetual", *(name for name, other in kinds.items() if other)])
 
@@ -172,8 +184,9 @@ def going_on(policy: Perpetual, wanted: StagedPerpetual, returns: bool = False) 
 
 
 def _phc() -> dict[str, Any]:
-    """What `paper` and `code` share. The paper: goals, absolute actions, no help, networks of 1024 and
-    512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds, steps."""
+    """Settings that `paper` and `code` share. The paper: goals, absolute actions, no help, networks of
+    1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds,
+    steps."""
     from poise.body import BodyConfig
     from poise.learn import PPOConfig
     from poise.sim import SimConfig

@@ -79,7 +79,7 @@ class PrimitiveOrder(StageOrder):
 
     @property
     def first(self) -> Stage:
-        """What a run begins with."""
+        """The first stage of a run."""
         if self.config.single or not self.config.multiplicative:
             return Stage("single")
         return Stage("primitive" if self.config.progressive else "joint")
@@ -94,7 +94,7 @@ class PrimitiveOrder(StageOrder):
         return stage.kind == "primitive" and alone
 
     def following(self, stage: Stage, fails: bool) -> Stage | None:
-        """What comes after a stage; None ends the training."""
+        """The stage after this one; None ends the training."""
         number = stage.number + 1
         if self.lasts(stage) or stage.kind in WHOLE:
             return super().following(stage, fails)
@@ -190,9 +190,15 @@ class PrimitiveOrder(StageOrder):
         return clone_for(int(imitation.reference.length.sum()), worlds, PER_FRAME, MOST, NOISE)
 
     def next(
-        self, before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
-        dumps: Path | None, tell: TrainingCallbacks,
-    ) -> WarmStart:  # fmt: skip
+        self,
+        before: WarmStart,
+        imitation: Imitation,
+        stage: Stage,
+        owner: Tensor,
+        threads: int,
+        dumps: Path | None,
+        tell: TrainingCallbacks,
+    ) -> WarmStart:
         """What a later stage starts from: one primitive more, a composer, or the same network."""
         if stage.kind == "composer":
             return self.composer(before, imitation, stage, owner, threads, dumps, tell)
@@ -214,9 +220,15 @@ class PrimitiveOrder(StageOrder):
         return replace(before, policy=next_column(before.policy, start, generator=rng))
 
     def composer(
-        self, before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
-        dumps: Path | None, tell: TrainingCallbacks,
-    ) -> WarmStart:  # fmt: skip
+        self,
+        before: WarmStart,
+        imitation: Imitation,
+        stage: Stage,
+        owner: Tensor,
+        threads: int,
+        dumps: Path | None,
+        tell: TrainingCallbacks,
+    ) -> WarmStart:
         """The composer over all primitives, taught at first to do as the primitive that learned the
         clip, and as the recovery primitive on recovery motions and for characters that are far.
 
@@ -238,9 +250,14 @@ class PrimitiveOrder(StageOrder):
         settings = replace(settings, rounds=min(1, settings.rounds), critic_steps=0)
         try:
             taught, _ = clone(
-                cast(VecEnv, env), Owners(env, policy, owner, self.own_recovery), settings,
-                imitation.ppo(), config.seed, tell.round, policy,
-            )  # fmt: skip
+                cast(VecEnv, env),
+                Owners(env, policy, owner, self.own_recovery),
+                settings,
+                imitation.ppo(),
+                config.seed,
+                tell.round,
+                policy,
+            )
         except UnstableError as problem:
             if tell.failed is not None:
                 tell.failed(str(problem))
