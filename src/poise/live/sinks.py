@@ -212,8 +212,8 @@ class OwnPuppet:
 
     The pose that came in goes out, turned by what the simulated body differs from its goal: with no
     difference it is what came, to the last digit, whatever a body's hinges cannot do. Each bone's
-    rotation is P_sim K with K = P_goal^-1 R, R being the person's and P the puppet's; while the character
-    follows something else K fades to none.
+    rotation is P_sim K with K = P_goal^-1 R, R being the person's and P the puppet's; while the
+    character follows something else K fades to none.
 
     Args:
         table: the body.
