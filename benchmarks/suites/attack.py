@@ -20,7 +20,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -60,20 +60,35 @@ def child(pipe: Connection, name: str, folder: str) -> None:
     pipe.send((*said, seconds, memory * 1024, size))
 
 
+def started(target: Callable[..., None], *args: Any) -> multiprocessing.process.BaseProcess:
+    """The function in a process of its own, forked from one that has imported this and has no threads.
+
+    A fork of this process may wait for threads that do not come along.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    made = context.Process(target=target, args=args)
+    made.start()
+    return made
+
+
 def outcome(name: str) -> dict[str, Any]:
     """One row of the table."""
-    context = multiprocessing.get_context("fork")
     with tempfile.TemporaryDirectory() as folder:
-        here, there = context.Pipe()
-        process = context.Process(target=child, args=(there, name, folder))
+        here, there = multiprocessing.Pipe()
         begun = time.monotonic()
-        process.start()
+        process = started(child, there, name, folder)
         there.close()
+        kind, said, seconds, memory, size = "no answer", "", float(STOP_S), 0, 0
+        # A process that waits needs no processor time: the limit on that does not end it.
         try:
-            kind, said, seconds, memory, size = here.recv()
+            if here.poll(2 * STOP_S):
+                kind, said, seconds, memory, size = here.recv()
+            else:
+                process.kill()
         except EOFError:
             process.join()
-            kind, said, seconds, memory = f"exit code {process.exitcode}", "", float(STOP_S), 0, 0
+            kind = f"exit code {process.exitcode}"
         process.join()
     # What a sound file of that size may take.
     quick = seconds < max(SECONDS, 5 + size / 1e6)
@@ -150,26 +165,20 @@ def command_of(recipe: str, here: Path, out: Path) -> list[str]:
     }[recipe]  # fmt: skip
 
 
-def start(argv: list[str], log: Path) -> multiprocessing.process.BaseProcess:
-    """`poise ARGV` in a process of its own, which shares what is imported here."""
-
-    def child() -> None:
-        os.setsid()
-        for stream in (1, 2):
-            os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
-        torch.set_num_threads(1)
-        tiny_perpetual()
-        sys.exit(command_line(argv))
-
-    made = multiprocessing.get_context("fork").Process(target=child)
-    made.start()
-    return made
+def miniature_of(argv: list[str], log: Path) -> None:
+    """`poise ARGV` with tiny networks; what it says goes into a file."""
+    os.setsid()
+    for stream in (1, 2):
+        os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
+    torch.set_num_threads(1)
+    tiny_perpetual()
+    sys.exit(command_line(argv))
 
 
 def finished(argv: list[str], log: Path, within: float) -> float:
     """Runs to the end; its seconds."""
     begun = time.monotonic()
-    process = start(argv, log)
+    process = started(miniature_of, argv, log)
     process.join(within)
     if process.exitcode != 0:
         process.kill()
@@ -223,7 +232,7 @@ def killed(argv: list[str], out: Path, log: Path, seconds: float, rng: random.Ra
     count = 0
     for _ in range(rng.randint(1, MOST)):
         again = ["--resume"] if out.exists() else []
-        process = start([*argv, *again], log)
+        process = started(miniature_of, [*argv, *again], log)
         process.join(rng.uniform(0.05, 1.0) * seconds)
         if process.exitcode is not None:
             break
