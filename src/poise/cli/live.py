@@ -80,9 +80,9 @@ def run(
         )
     from poise.jobs.open import open_run
     from poise.kinematics.travel import find_travel, travelled
+    from poise.live.guard import LOOPBACK
     from poise.live.protocol import LiveConfig
     from poise.live.session import Session, SessionConfig
-    from poise.live.sockets import LOOPBACK
 
     with working("opening the policy"):
         paths = () if live_in else clips or (Path(__file__).parents[1] / "data" / "walk.bvh",)

@@ -24,12 +24,13 @@ from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
+from poise.live.guard import Guard
 from poise.live.page.server import PageServer
 from poise.live.people import STAND, Steady
 from poise.live.points import PointFit
 from poise.live.protocol import DOING, LiveConfig, as_json, packed
 from poise.live.sinks import CharacterRecorder, OwnPuppet, VmcSink
-from poise.live.sockets import Guard, StreamDoor
+from poise.live.sockets import StreamDoor
 from poise.live.sources import FileSource
 from poise.live.stream import Inbox, StreamTremble
 from poise.live.targets import Targets

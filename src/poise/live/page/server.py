@@ -1,62 +1,39 @@
-"""The server: a page, its files, and three doors for WebSockets, in a thread of its own."""
+"""The server of live motion: a page, its files, and three doors for WebSockets."""
 
 from __future__ import annotations
 
 import asyncio
-import http
 import json
-import threading
 from collections.abc import Callable
-from importlib.resources import files
 from typing import Any
-from urllib.parse import urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers
+from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request, Response
 
 from poise.errors import PoiseError
+from poise.live.guard import Bucket, Guard
+from poise.live.page.web import CSS, HTML, JS, Asset, WebServer, path_of
 from poise.live.protocol import MOST_BYTES, VERSION, command, parse
-from poise.live.sockets import WAITING, Bucket, Guard, GuardedSocket, pauses
 from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
 
-#: What can be fetched: a fixed list, so that no path leads to a file of the user's.
-PAGES = {
-    "/": ("live.page", "live.html", "text/html; charset=utf-8"),
-    "/live.js": ("live.page", "live.js", "text/javascript; charset=utf-8"),
-    "/stage.js": ("score.report", "stage.js", "text/javascript; charset=utf-8"),
-    "/characters.js": ("live.page", "characters.js", "text/javascript; charset=utf-8"),
-    "/live.css": ("live.page", "live.css", "text/css; charset=utf-8"),
-    "/three.js": ("score.report", "three.min.js", "text/javascript; charset=utf-8"),
+#: The stage that report, live page and the page of `poise open` share.
+STAGE: dict[str, Asset] = {
+    "/stage.js": ("score.report", "stage.js", JS),
+    "/three.js": ("score.report", "three.min.js", JS),
 }
-DOORS = ("/live", "/bodies", "/stream")
-_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-#: s that a handshake may take, and s between figures.
-HANDSHAKE_S, FIGURES_S = 5.0, 0.25
+#: What can be fetched.
+PAGES: dict[str, Asset] = {
+    "/": ("live.page", "live.html", HTML),
+    "/live.js": ("live.page", "live.js", JS),
+    "/characters.js": ("live.page", "characters.js", JS),
+    "/live.css": ("live.page", "live.css", CSS),
+    **STAGE,
+}
+#: s between figures.
+FIGURES_S = 0.25
 #: Refusals that a connection is told the reasons of; more are counted alone.
 TOLD = 50
-
-
-class _Connection(ServerConnection):
-    """A connection that is counted out when it ends."""
-
-    guard: Guard
-    _peer = ""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        peer = transport.get_extra_info("peername")
-        # One that is gone already has no name.
-        self._peer = str(peer[0]) if peer else ""
-        super().connection_made(transport)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.guard.leave(self._peer)
-        super().connection_lost(exc)
 
 
 class PageServer:
@@ -89,83 +66,37 @@ class PageServer:
         self.guard, self.inbox, self.clock = guard, inbox, clock
         self._command, self._figures = command, figures
         self._hello = json.dumps({"v": VERSION, "type": "hello", **hello})
-        self._pages = {path: _read(*where) for path, where in PAGES.items()}
         self._newest: tuple[bytes, str] = (b"", "")
         self._fresh: asyncio.Event | None = None
         self._numbers, self._streams = "", 0
-        self._ready, self._problem = threading.Event(), ""
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stop: asyncio.Event | None = None
-        self.watchers = 0
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), daemon=True)
-        self._thread.start()
-        self._ready.wait(10.0)
-        if self._problem:
-            hint = "Give another --port, or stop the program that has it"
-            raise PoiseError(
-                f"cannot listen on {guard.host}:{guard.port}: {self._problem}",
-                hint=hint,
-                code="cannot-listen",
-            )
+        self.watchers = self._programs = 0
+        doors = {"/live": self._watched, "/bodies": self._watched, "/stream": self._streamed}
+        self._web = WebServer(guard, PAGES, doors, MOST_BYTES, self._count)
 
     @property
     def url(self) -> str:
         """Where the page is, with the token."""
-        host = f"[{self.guard.host}]" if ":" in self.guard.host else self.guard.host
-        more = f"?token={self.guard.token}" if self.guard.token else ""
-        return f"http://{host}:{self.guard.port}/{more}"
+        return self._web.url
 
     def publish(self, frame: bytes, text: Callable[[], str] | str) -> None:
         """The newest control step; a slow page misses some. Returns at once."""
         words = text if isinstance(text, str) else (text() if self._programs else "")
         self._newest = (frame, words)
-        if self._loop is not None and self._loop.is_running():
-            self._loop.call_soon_threadsafe(self._wake)
+        self._web.soon(self._wake)
 
     def close(self) -> None:
         """Stops serving."""
-        if self._loop is not None and self._stop is not None and self._loop.is_running():
-            self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(5.0)
+        self._web.close()
 
-    # --- the thread ---------------------------------------------------------------------------
-
-    _programs = 0
+    # --- in the server's thread ---------------------------------------------------------------
 
     def _wake(self) -> None:
         if self._fresh is not None:
             fresh, self._fresh = self._fresh, asyncio.Event()
             fresh.set()
 
-    async def _serve(self) -> None:
-        self._loop, self._stop, self._fresh = (
-            asyncio.get_running_loop(),
-            asyncio.Event(),
-            asyncio.Event(),
-        )
-        guard = self.guard
-        kind = type("Connection", (_Connection,), {"guard": guard})
-        self._loop.set_exception_handler(pauses)
-        try:
-            server: Server = await serve(
-                self._handle, sock=GuardedSocket(guard), backlog=WAITING, process_request=self._answer,
-                create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
-                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=60,
-                compression=None, server_header=None, logger=_quiet(),
-            )  # fmt: skip
-        except OSError as problem:
-            self._problem = problem.strerror or str(problem)
-            self._ready.set()
-            return
-        guard.port = server.sockets[0].getsockname()[1]
-        self._ready.set()
-        counting = asyncio.create_task(self._count())
-        await self._stop.wait()
-        counting.cancel()
-        server.close()
-        await server.wait_closed()
-
     async def _count(self) -> None:
+        self._fresh = asyncio.Event()
         while True:
             await asyncio.sleep(FIGURES_S)
             if self.watchers:
@@ -173,29 +104,11 @@ class PageServer:
                 told["strangers"] = dict(self.guard.refused)
                 self._numbers = json.dumps(told)
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Pages and refusals; None opens a door."""
-        headers = {k: v for k, v in request.headers.raw_items()}
-        headers = {k.title(): v for k, v in headers.items()}
-        no = self.guard.admits(request.path, headers)
-        if no is not None:
-            return _response(no[0], no[1].encode() + b"\n", "text/plain")
-        if request.method != "GET":
-            return _response(405, b"Only GET is known here.\n", "text/plain")
-        path = urlsplit(request.path).path
-        if path in DOORS:
-            return None
-        if path not in self._pages:
-            return _response(404, b"There is nothing here.\n", "text/plain")
-        body, kind = self._pages[path]
-        return _response(200, body, kind)
+    async def _streamed(self, connection: ServerConnection) -> None:
+        await self._receive(connection, None)
 
-    async def _handle(self, connection: ServerConnection) -> None:
-        path = urlsplit(connection.request.path if connection.request else "").path
-        if path == "/stream":
-            await self._receive(connection, None)
-            return
-        text = path == "/bodies"
+    async def _watched(self, connection: ServerConnection) -> None:
+        text = path_of(connection) == "/bodies"
         self.watchers += 1
         self._programs += text
         try:
@@ -235,7 +148,7 @@ class PageServer:
     async def _receive(
         self, connection: ServerConnection, obey: Callable[[dict[str, Any]], None] | None
     ) -> None:
-        bucket, path = Bucket(), urlsplit(connection.request.path if connection.request else "").path
+        bucket, path = Bucket(), path_of(connection)
         self._streams += path == "/stream"
         said = 0
         stream = JsonStream(self.inbox, f"{self._streams}:", self._points) if path == "/stream" else None
@@ -273,26 +186,3 @@ def _obeyed(message: str | bytes, obey: Callable[[dict[str, Any]], None]) -> str
     except PoiseError as problem:
         return problem.what
     return None
-
-
-def _read(room: str, name: str, kind: str) -> tuple[bytes, str]:
-    return files(f"poise.{room}").joinpath("assets").joinpath(name).read_bytes(), kind
-
-
-def _response(status: int, body: bytes, kind: str) -> Response:
-    headers = Headers()
-    headers["Content-Type"], headers["Content-Length"] = kind, str(len(body))
-    headers["Content-Security-Policy"], headers["X-Content-Type-Options"] = _POLICY, "nosniff"
-    headers["Referrer-Policy"], headers["Cache-Control"] = "no-referrer", "no-store"
-    headers["Connection"] = "close"
-    return Response(status, http.HTTPStatus(status).phrase, headers, body)
-
-
-def _quiet() -> Any:
-    """A logger that says nothing: what strangers send is counted, not printed."""
-    import logging
-
-    out = logging.getLogger("poise.live.server")
-    out.addHandler(logging.NullHandler())
-    out.propagate = False
-    return out
