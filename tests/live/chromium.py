@@ -39,7 +39,7 @@ class Page:
         while True:
             told = json.loads(self._socket.recv(timeout=60))
             if told.get("method") == "Runtime.exceptionThrown":
-                self.errors.append(told["params"]["exceptionDetails"].get("text", "?"))
+                d = told["params"]["exceptionDetails"]; self.errors.append(d.get("exception", {}).get("description") or d.get("text", "?"))
             if told.get("id") == self._id:
                 assert "error" not in told, told
                 return told["result"]

@@ -32,6 +32,7 @@ VERBS = {
     "complete": "from keyframes to a body: fill the frames, and let a character do them",
     "track": "let a trained policy do any motion, without training",
     "push": "a motion with a push in it: the character gives way and comes back",
+    "open": "a page for people who animate: see, mend, give it a body, push, export",
     "live": "streams of motion in, characters in a browser out: push them, they get up",
     "dream": "let a character go about, without task, clip or end",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
@@ -130,7 +131,9 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         inputs += inputs_of(options)
         # What is imported now takes seconds.
         tell(_begins(verb, inputs), "dim")
-    _share_cores(verb not in _LIGHT)
+    if verb != "open":
+        # Its jobs have processes of their own.
+        share_cores(verb not in _LIGHT)
     answer = module.run(**options) if isinstance(options, dict) else module.run(options, rest)
     notes([n for n in answer.notes if n not in answer.said])
     for path in answer.outputs.values():
@@ -155,7 +158,7 @@ def _begins(verb: str, inputs: Sequence[Path]) -> str:
     return f"{doing} {', '.join(map(str, inputs[:3]))}{more}"
 
 
-def _share_cores(physics: bool) -> None:
+def share_cores(physics: bool) -> None:
     """One thread for torch, since the physics uses the cores; OMP_NUM_THREADS overrules it. physics:
     whether the verb needs MuJoCo, which takes time to load."""
     try:

@@ -1,4 +1,4 @@
-"""What is let in: addresses, origins, tokens, and how many connections and messages."""
+"""What is let in: addresses, origins, tokens, how many connections and messages, and what is a message."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import errno
 import hmac
+import json
+import re
 import socket
 import time
 from collections import Counter
@@ -15,6 +17,12 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
+from poise.errors import PoiseError
+
+#: Version of the protocol; bytes and depth of a message.
+VERSION, MOST_BYTES, DEPTH = 1, 65_536, 5
+#: Words in quotes, the last of which may not end, and brackets.
+_MARKS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\\?\Z)|[\[\]{}]', re.DOTALL)
 #: Names of this machine.
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 #: Connections at once, of one address and in all; messages a second of a connection, and at once.
@@ -185,3 +193,44 @@ def pauses(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     problem = context.get("exception")
     if not (isinstance(problem, OSError) and problem.errno == errno.EMFILE):
         loop.default_exception_handler(context)
+
+
+def parse(text: str | bytes) -> dict[str, Any]:
+    """A message as a dictionary.
+
+    Raises:
+        PoiseError: too long, too deep, no JSON, no object, or of another version.
+    """
+    if len(text) > MOST_BYTES:
+        raise PoiseError("too long", "message", code="over-limit")
+    try:
+        words = text.decode("utf-8") if isinstance(text, bytes) else text
+    except UnicodeDecodeError:
+        raise PoiseError("no UTF-8", "message", code="not-text") from None
+    _shallow(words)
+    try:
+        out = json.loads(words, parse_constant=_none)
+    except (ValueError, RecursionError):
+        raise PoiseError("no JSON", "message", code="bad-json") from None
+    if not isinstance(out, dict):
+        raise PoiseError("no object", "message", code="not-an-object")
+    if out.get("v") != VERSION:
+        raise PoiseError("other version", "message", f'Say "v": {VERSION}', code="version-differs")
+    return out
+
+
+def _none(word: str) -> float:
+    """NaN and infinity are no JSON; where they are sent all the same they are seen as what they are."""
+    return float(word)
+
+
+def _shallow(text: str) -> None:
+    depth = 0
+    for found in _MARKS.finditer(text):
+        mark = found[0][0]
+        if mark in "[{":
+            depth += 1
+            if depth > DEPTH:
+                raise PoiseError("too deep", "message", code="nested-too-deep")
+        elif mark != '"':
+            depth -= 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,58 +13,16 @@ from typing import Annotated, Any
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.live.guard import VERSION
 from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
 from poise.settings import Range, Share, validate
 
-#: Version of the protocol; bytes and depth of a message; joints of a skeleton.
-VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
+#: Joints of a skeleton.
+JOINTS = 256
 _MOST = 1e6
-#: Words in quotes, the last of which may not end, and brackets.
-_MARKS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\\?\Z)|[\[\]{}]', re.DOTALL)
 #: Verticals; -Y is that of cameras, with x to the right and z into the picture.
 UPS = ("Y", "Z", "-Y")
-
-
-def parse(text: str | bytes) -> dict[str, Any]:
-    """A message as a dictionary.
-
-    Raises:
-        PoiseError: too long, too deep, no JSON, no object, or of another version.
-    """
-    if len(text) > MOST_BYTES:
-        raise PoiseError("too long", "message", code="over-limit")
-    try:
-        words = text.decode("utf-8") if isinstance(text, bytes) else text
-    except UnicodeDecodeError:
-        raise PoiseError("no UTF-8", "message", code="not-text") from None
-    _shallow(words)
-    try:
-        out = json.loads(words, parse_constant=_none)
-    except (ValueError, RecursionError):
-        raise PoiseError("no JSON", "message", code="bad-json") from None
-    if not isinstance(out, dict):
-        raise PoiseError("no object", "message", code="not-an-object")
-    if out.get("v") != VERSION:
-        raise PoiseError("other version", "message", f'Say "v": {VERSION}', code="version-differs")
-    return out
-
-
-def _none(word: str) -> float:
-    """NaN and infinity are no JSON; where they are sent all the same they are seen as what they are."""
-    return float(word)
-
-
-def _shallow(text: str) -> None:
-    depth = 0
-    for found in _MARKS.finditer(text):
-        mark = found[0][0]
-        if mark in "[{":
-            depth += 1
-            if depth > DEPTH:
-                raise PoiseError("too deep", "message", code="nested-too-deep")
-        elif mark != '"':
-            depth -= 1
 
 
 def number(value: Any, low: float = -_MOST, high: float = _MOST) -> float:

@@ -12,16 +12,11 @@ from websockets.exceptions import ConnectionClosed
 
 from poise.errors import PoiseError
 from poise.live.guard import Bucket, Guard
-from poise.live.page.web import CSS, HTML, JS, Asset, WebServer, path_of
+from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, WebServer, path_of
 from poise.live.protocol import MOST_BYTES, VERSION, command, parse
 from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
 
-#: The stage that report, live page and the page of `poise open` share.
-STAGE: dict[str, Asset] = {
-    "/stage.js": ("score.report", "stage.js", JS),
-    "/three.js": ("score.report", "three.min.js", JS),
-}
 #: What can be fetched.
 PAGES: dict[str, Asset] = {
     "/": ("live.page", "live.html", HTML),
@@ -32,8 +27,6 @@ PAGES: dict[str, Asset] = {
 }
 #: s between figures.
 FIGURES_S = 0.25
-#: Refusals that a connection is told the reasons of; more are counted alone.
-TOLD = 50
 
 
 class PageServer:

@@ -28,6 +28,13 @@ _POLICY = (
 #: s that a handshake may take.
 HANDSHAKE_S = 5.0
 HTML, JS, CSS = (f"text/{kind}; charset=utf-8" for kind in ("html", "javascript", "css"))
+#: The stage that report, live page and the page of `poise open` share.
+STAGE: dict[str, Asset] = {
+    "/stage.js": ("score.report", "stage.js", JS),
+    "/three.js": ("score.report", "three.min.js", JS),
+}
+#: Refusals that a connection is told the reasons of; more are counted alone.
+TOLD = 50
 
 
 class Content(NamedTuple):
@@ -171,7 +178,9 @@ def path_of(connection: ServerConnection) -> str:
 
 
 def _read(room: str, name: str, kind: str) -> tuple[bytes, str]:
-    return files(f"poise.{room}").joinpath("assets").joinpath(name).read_bytes(), kind
+    # Found by its path, since importing a room takes time.
+    place = files("poise").joinpath(*room.split("."), "assets", name)
+    return place.read_bytes(), kind
 
 
 def _response(status: int, content: Content, cookie: str | None = None) -> Response:

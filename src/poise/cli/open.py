@@ -1,0 +1,139 @@
+"""`poise open`: a page for people who animate, on their machine."""
+
+from __future__ import annotations
+
+import contextlib
+import json as json_
+import secrets
+import signal
+import sys
+import threading
+import webbrowser
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from poise.cli.console import Answer, failure, say, tell
+from poise.cli.options import Flag, Json, Reading, check_range
+from poise.errors import PoiseError
+
+#: Modules that a job's process knows when it begins.
+PRELOAD = (
+    "torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.jobs.track", "poise.jobs.complete",
+    "poise.cli.track", "poise.cli.push", "poise.cli.complete", "poise.cli.doctor", "poise.cli.convert",
+    "poise.cli.retarget",
+)  # fmt: skip
+#: s between two lines of progress of a job.
+PROGRESS_S = 0.25
+
+
+def run(
+    clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE ...", help_behavior_hint="")] = (),
+    project: Annotated[Path, arg(aliases=["-o"], metavar="DIR")] = Path("poise-project"),
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[int, arg(metavar="PORT")] = 8018,
+    browser: Flag = True,
+    json: Json = False,
+) -> Answer:
+    """Show motions in a browser, with their faults on a timeline and a button for each thing to do: mend,
+    give it a body, onto a rig, between keys, push, put a chair, export. Ctrl-C ends it; the project opens
+    again.
+
+    Args:
+        clips: motion files; a folder that holds a project opens that.
+        project: the folder of what is made; what is there already is shown again.
+        host: the address to listen on. Any other than this machine's own lets others in that know the
+            token in the address.
+        port: the port of the page; 0 takes a free one.
+        browser: open no browser; the address is printed.
+    """
+    check_range("port", port, 0, 65_535)
+    from poise.live.guard import LOOPBACK, Guard
+    from poise.live.open.project import FILE, Project
+    from poise.live.open.server import OpenServer, Runs
+
+    if len(clips) == 1 and (clips[0] / FILE).is_file():
+        project, clips = clips[0], ()
+    for path in clips:
+        if not path.is_file():
+            what = "is a folder, and poise open shows files" if path.is_dir() else "there is no such file"
+            raise PoiseError(what, path, "Name motion files", code="file-missing")
+    held = Project(project)
+    guard = Guard(host, port, secrets.token_urlsafe(24))
+    server = OpenServer(held, guard, Runs(work, look, rests, PRELOAD))
+    try:
+        for path in reversed(clips):
+            server.add_file(path)
+        (tell if json else say)(f"Poise: {server.url}", "bold")
+        say(f"The project: {held.folder}")
+        if host not in LOOPBACK:
+            tell(f"Others can reach this machine at {host}. The token in the address lets them in.")
+        tell("Ctrl-C ends it.", "dim")
+        if browser and not webbrowser.open(server.url):
+            tell("No browser could be opened; open the address by hand.")
+        _until_told()
+    finally:
+        server.close()
+    return Answer({"project": str(held.folder), "motions": len(held.takes)})
+
+
+def _until_told() -> None:
+    """Waits for Ctrl-C, or for the system to end it."""
+    done = threading.Event()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, lambda *_: done.set())
+    with contextlib.suppress(KeyboardInterrupt):
+        while not done.wait(0.5):
+            pass
+
+
+def work(argv: list[str], folder: Path) -> None:
+    """A job: the command line `poise ARGV --json`, in the folder `folder`."""
+    import os
+
+    from poise.cli import training
+    from poise.cli.main import main
+
+    os.chdir(folder)
+    Path("result").mkdir(exist_ok=True)
+    training.EVERY_S = PROGRESS_S
+    sys.exit(main([*argv, "--json"]))
+
+
+def look(path: str, reading: dict[str, Any], room: str, folder: Path) -> None:
+    """A job: what the page draws of a file, into `room`."""
+
+    def made() -> dict[str, Any]:
+        from poise.live.open.look import write_look
+
+        write_look(Reading(**reading).read(Path(path)), Path(room))
+        return {}
+
+    _answered(made)
+
+
+def rests(path: str, reading: dict[str, Any], folder: Path) -> None:
+    """A job: what a motion rests on."""
+
+    def made() -> dict[str, Any]:
+        from poise.live.open.look import rests_of
+
+        tell("looking what it rests on")
+        return {"boxes": rests_of(Reading(**reading).read(Path(path)))}
+
+    _answered(made)
+
+
+def _answered(made: Any) -> None:
+    """Writes what was made, or why it was not, as JSON."""
+    from poise.cli.main import share_cores
+
+    share_cores(True)
+    try:
+        answer: dict[str, Any] = {"ok": True, **made()}
+    except (KeyboardInterrupt, Exception) as problem:
+        error = failure(problem)[1]
+        answer = {"ok": False, "error": {"what": error.what, "where": error.where, "hint": error.hint}}
+    sys.stdout.write(json_.dumps(answer, default=str))
+    sys.stdout.flush()
