@@ -303,8 +303,8 @@ def run_on(path: Path, options: Options) -> Answer:
         return Answer(facts, {"clip": target}, told, outcome=outcome, said=told)
     _compare(found, left)
     if kept := facts["fixed"]["detail"]:
-        told = ", ".join(f"{100 * share:.0f} % at {band}" for band, share in kept.items())
-        say(f"Of the movement is left: {told}.")
+        shares = ", ".join(f"{100 * share:.0f} % at {band}" for band, share in kept.items())
+        say(f"Of the movement is left: {shares}.")
     if worse := facts["fixed"]["worse"]:
         say(f"Mending made these figures worse: {', '.join(worse)}.")
     if rate := _hidden_rate(found, left):

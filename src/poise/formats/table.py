@@ -14,6 +14,7 @@ from poise.formats.bvh import read_bvh, write_bvh
 from poise.formats.c3d import c3d_points, looks_like_c3d
 from poise.formats.deepmimic import read_deepmimic
 from poise.formats.fbx import looks_like_fbx, read_fbx
+from poise.formats.fbx_write import write_fbx
 from poise.formats.gltf import read_gltf
 from poise.formats.gltf_write import write_gltf
 from poise.formats.named_arrays import (
@@ -245,6 +246,7 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
     ".usd": write_usd,
     ".usda": write_usd,
     ".usdc": write_usd,
+    ".fbx": write_fbx,
 }
 
 

@@ -198,7 +198,7 @@ ACTIONS: dict[str, Action] = {
 }  # fmt: skip
 #: Formats of an export, by suffix.
 EXPORTS = {
-    ".bvh": "BVH", ".glb": "GLB", ".usda": "USD", ".npz": "npz (AMASS or Poise)", ".csv": "CSV",
+    ".bvh": "BVH", ".fbx": "FBX", ".glb": "GLB", ".usda": "USD", ".npz": "npz (AMASS or Poise)", ".csv": "CSV",
 }  # fmt: skip
 #: What may be stated of a file, by the name of its option.
 READING: dict[str, tuple[str, ...] | None] = {
