@@ -35,7 +35,8 @@ class Field:
             on; maps: pairs of joints.
         default: the command line says nothing where the value is this. low, high, step: of a number.
         whole: a number without a fraction. advanced: shown in a fold.
-        negative: the flag is said where the value is off.
+        negative: the flag is said where the value is off. always: said also where it is the default, since
+            that of the command line is another one.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Field:
     advanced: bool = False
     flag: str = ""
     negative: bool = False
+    always: bool = False
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ ACTIONS: dict[str, Action] = {
             "push", "pushed",
             (
                 Field("at", "Where", "choice", "chest", "The part that is pushed; or drag on the figure.",
-                      choices=tuple((p, p.replace("_", " ")) for p in PARTS)),
+                      choices=tuple((p, p.replace("_", " ")) for p in PARTS), always=True),
                 Field("force", "Force", "number", 150.0, "How hard.", 1, 5000, 10, "N"),
                 Field("start", "Begins", "number", 1.0, "When it begins: at the frame that is shown.", 0, 1e5,
                       0.01, "s", flag="from"),
@@ -186,7 +188,8 @@ ACTIONS: dict[str, Action] = {
             (
                 Field("span", "Range", "vector", None, "In s, from the timeline.", flag="range"),
                 _PINS, _TOUCHES, _BUDGET, _HOLD,
-                Field("seed", "Seed", "number", 1, "Another one gives another take.", 0, 1e6, whole=True),
+                Field("seed", "Seed", "number", 1, "Another one gives another take.", 0, 1e6, whole=True,
+                      always=True),
             ),
             folder=True, needs=True,
         ),
@@ -203,7 +206,7 @@ EXPORTS = {
 #: What may be stated of a file, by the name of its option.
 READING: dict[str, tuple[str, ...] | None] = {
     "up": ("Y", "Z", "X", "-Y", "-Z", "-X"), "unit": None, "fps": None, "ground": None, "take": None,
-    "swap_sides": None, "raw": None, "skeleton": None,
+    "swap_sides": None, "raw": None, "allow_pickle": None,
 }  # fmt: skip
 
 
@@ -235,7 +238,7 @@ def reading_of(given: Any) -> dict[str, Any]:
         known = READING[name]
         if value in (None, "", False):
             continue
-        if name in ("swap_sides", "raw"):
+        if name in ("swap_sides", "raw", "allow_pickle"):
             out[name] = bool(value)
         elif name == "fps":
             out[name] = _number(value, name, 0.1, 10_000)
@@ -277,7 +280,7 @@ def words_of(action: Action, given: Any, frames: int, onto: Mapping[str, Path], 
     words = list(action.words)
     for name, f in known.items():
         value = given.get(name, f.default)
-        if value is None or value == f.default or value == [] or value == "":
+        if value is None or value in ([], (), "") or (value == f.default and not f.always):
             continue
         words += _words(f, value, frames, onto, boxes)
     return words

@@ -138,7 +138,6 @@ def rests_of(clip: Clip) -> list[dict[str, Any]]:
 
     session = TrackSession(open_run(None).tracker, TrackConfig(), [clip])
     for feature in FEATURES:
-        if session.supports or not feature.asked(session):
-            break
-        feature.prepare(session)
+        if feature.asked(session):
+            feature.prepare(session)
     return [s.to_dict() for s in at_home(session.supports, session.placed[0])]

@@ -92,6 +92,7 @@ class OpenServer:
         self._event_count = 0
         self._exports: dict[str, Path] = {}
         self._looking: dict[str, int] = {}
+        self._stood: dict[str, list[dict[str, Any]]] = {}
         self._fresh: asyncio.Event | None = None
         self._jobs = project.folder / ".jobs"
         shutil.rmtree(self._jobs, ignore_errors=True)
@@ -223,6 +224,7 @@ class OpenServer:
                 "reading": t.reading, "says": t.says, "moment": t.moment, "simulated": bool(t.result),
                 "suffix": Path(t.file).suffix.lower(), "figure": self._stamp(t, "figure.bin"),
                 "judged": self._stamp(t, "judged.json"), "looking": self._looking.get(t.id, 0) > 0,
+                "boxes": self._stands(t),
                 "report": bool(t.result) and (self.project.folder / t.result / "report.html").exists(),
             }
             for t in list(self.project.takes.values()) if not t.hidden
@@ -231,6 +233,16 @@ class OpenServer:
             "v": VERSION, "type": "project", "folder": str(self.project.folder), "takes": takes,
             "current": self.project.current, "jobs": self.workers.told(), "events": self._events,
         }  # fmt: skip
+
+    def _stands(self, take: Take) -> list[dict[str, Any]]:
+        """What a body that did a motion stood, sat or leaned on."""
+        if take.result and take.id not in self._stood:
+            try:
+                text = (self.project.folder / take.result / "supports.json").read_text(encoding="utf-8")
+                self._stood[take.id] = [dict(row) for row in json.loads(text)]
+            except (OSError, ValueError, TypeError):
+                self._stood[take.id] = []
+        return self._stood.get(take.id, [])
 
     def _stamp(self, take: Take, name: str) -> int:
         try:
@@ -539,6 +551,10 @@ def sentences(action: Action, answer: Mapping[str, Any]) -> list[str]:
             out.append(f"Worse than before: {', '.join(worse)}.")
     if score := result.get("score"):
         out.append(str(result.get("sentence") or ""))
+        if push := result.get("push"):
+            back = push.get("back_s")
+            came = "was not back at the end" if back is None else f"was back {back:.1f} s after the push"
+            out.append(f"The body gave way by {push['moved_m']:.2f} m and {came}.")
         aid = score.get("help") or {}
         force = aid.get("force_mean_n") or 0.0
         out.append("Nothing helped the body: 0 N." if not force else f"Help: {force:.0f} N on average.")

@@ -21,8 +21,8 @@ function actionForms(host, actions, world) {
     inside.append(make("span", { className: "away", textContent: "The command that does the same:" }), line);
     fold.append(inside);
     form.run = make("button", { className: "main", textContent: action.label, onclick: () => world.run(form) });
+    if (action.name === "chair") plain.prepend(make("button", { textContent: "Find what it rests on", onclick: () => world.rests() }));
     plain.prepend(make("p", { textContent: action.text }));
-    if (action.name === "chair") plain.append(make("button", { textContent: "Find what it rests on", onclick: () => world.rests() }));
     form.why = make("p", { className: "why" });
     plain.append(form.run, form.why, fold);
     form.box = make("details", { className: "action", id: `action-${action.name}` }, make("summary", { textContent: action.label }), plain);
@@ -139,11 +139,11 @@ function actionForms(host, actions, world) {
           else all[k][name][i] = value;
           set(all);
         };
-        return make("div", { className: "row" }, `${box.kind} `,
+        return make("div", { className: "row box" }, make("span", { textContent: box.kind }), gone(k),
           make("label", {}, "x ", number(box.pos[0], "x in m", change("pos", 0))), make("label", {}, "y ", number(box.pos[1], "y in m", change("pos", 1))),
           make("label", {}, "high ", number(box.pos[2] + box.size[2] / 2, "height of the seat in m", change("high"))),
           make("label", {}, "wide ", number(box.size[0], "width in m", change("size", 0))), make("label", {}, "deep ", number(box.size[1], "depth in m", change("size", 1))),
-          make("label", {}, "turn ", number(((box.yaw || 0) * 180) / Math.PI, "turn in degrees", change("yaw"), 5)), gone(k));
+          make("label", {}, "turn ", number(((box.yaw || 0) * 180) / Math.PI, "turn in degrees", change("yaw"), 5)));
       }),
     };
     const adds = {

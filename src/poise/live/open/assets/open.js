@@ -58,7 +58,7 @@
       rangeText: () => (range ? `frames ${range[0]} to ${range[1]}` : "mark one on the timeline: I and O, or Shift and drag"),
       limb: (name) => limbAt(name), seat: seatHere,
     });
-    for (const form of forms.values()) form.changed = () => { dirty = true; askLine(form); if (form.action.name === "chair") view.setBoxes(form.values.boxes); };
+    for (const form of forms.values()) form.changed = () => { dirty = true; askLine(form); if (form.action.name === "chair") showBoxes(); };
     view.changed(() => { dirty = true; });
     requestAnimationFrame(draw);
   }
@@ -78,6 +78,7 @@
     list();
     jobs();
     beside();
+    if (!motion()) judgements();
   }
   // Only what is looked at is fetched.
   const wanted = (t, kind) => t[kind] && [project.current, compare].includes(t.id) && (motions.get(t.id) || {})[`${kind}_at`] !== t[kind];
@@ -89,6 +90,8 @@
       const got = await fetch(`/${kind}/${t.id}`);
       if (!got.ok) throw new Error(got.statusText);
       mine[kind] = kind === "figure" ? decodeFigure(await got.arrayBuffer()) : await got.json();
+      // What the body sat on is there.
+      if (kind === "judged" && t.boxes.length) mine.judged.faults = mine.judged.faults.filter((f) => f.kind !== "support missing");
     } catch (error) {
       mine[`${kind}_at`] = 0;
       return;
@@ -136,7 +139,7 @@
     for (const one of project.takes) for (const kind of ["figure", "judged"]) if (wanted(one, kind)) load(one, kind);
     if (fresh && t.moment !== null) { frame = Math.max(t.moment - 10, 0); play(1); }
     forms.get("between").values.keyframes = [];
-    forms.get("chair").values.boxes = [];
+    forms.get("chair").values.boxes = t.boxes.map((b) => ({ kind: b.kind, size: b.size, pos: b.pos, yaw: b.yaw }));
     for (const form of forms.values()) for (const name of ["pins", "touches"]) if (form.values[name]) form.values[name] = [];
     for (const form of forms.values()) form.refresh();
     arrived("figure");
@@ -149,7 +152,7 @@
   function arrived(kind) {
     const m = motion();
     if (view) view.show(m, motion(compare));
-    if (!m) { line.show(null); return; }
+    if (!m) { line.show(null); judgements(); said(); return; }
     frame = Math.min(frame, m.frames - 1);
     if (joint === null || !m.names.includes(joint)) {
       const first = ["left_foot", "right_foot", "hips"].map((r) => m.roles[r]).find((j) => j !== undefined);
@@ -168,6 +171,7 @@
     judgements();
     said();
     seek(frame);
+    showBoxes();
     if (opened) opens(opened);
   }
   function timeline() {
@@ -278,9 +282,17 @@
   const UNIT_M = { m: 1, dm: 0.1, cm: 0.01, mm: 0.001, in: 0.0254, ft: 0.3048 };
   function judgements() {
     const j = judged(), t = take(), m = motion();
-    $("guessed").hidden = !m || Boolean(t.parent);
+    $("guessed").hidden = !t || Boolean(t.parent) || (!m && t.looking);
     $("faulty").hidden = !m;
-    if (!m) return;
+    if (!t || t.parent && !m) return;
+    if (!m) {
+      // It cannot be read: what is stated may help.
+      if ($("faulty").dataset.words === t.id) return;
+      $("faulty").dataset.words = t.id;
+      $("guessed").open = !t.looking;
+      $("guess-line").textContent = "it cannot be read so";
+      return guesses(null, null, t);
+    }
     const words = JSON.stringify([t.id, t.reading, t.figure, t.judged, Boolean(j)]);
     if ($("faulty").dataset.words === words) return;
     $("faulty").dataset.words = words;
@@ -316,7 +328,7 @@
       input.onchange = () => set(name, input.value);
       return input;
     };
-    const rate = make("input", { type: "number", min: 1, max: 1000, step: "any", placeholder: String(Number(m.fps.toPrecision(6))), value: stated.fps || "" });
+    const rate = make("input", { type: "number", min: 1, max: 1000, step: "any", placeholder: m ? String(Number(m.fps.toPrecision(6))) : "", value: stated.fps || "" });
     rate.onchange = () => set("fps", rate.value === "" ? null : Number(rate.value));
     const sides = make("input", { type: "checkbox", checked: Boolean(stated.swap_sides) });
     sides.onchange = () => set("swap_sides", sides.checked);
@@ -326,12 +338,15 @@
     floor.value = stated.ground || "";
     floor.onchange = () => set("ground", floor.value);
     const rows = [
-      one("up", "Up", auto("up", hello.reading.up.map((u) => [u, u]), stated.up ? "" : m.up_axis)),
-      one("unit", "Unit", auto("unit", UNITS, stated.unit ? "" : unitName(m.unit_m))),
+      one("up", "Up", auto("up", hello.reading.up.map((u) => [u, u]), stated.up || !m ? "" : m.up_axis)),
+      one("unit", "Unit", auto("unit", UNITS, stated.unit || !m ? "" : unitName(m.unit_m))),
       one("fps", "Rate, Hz", rate), one("ground", "Floor", floor), one("sides", "Swap sides", sides),
       make("div", { className: "guess" }, make("label", { title: "No tremble is taken off" }, "As it is", raw)),
     ];
-    if (m.format.includes("csv") || j && j.notes.some((n) => /animation|people|person/.test(n)) || stated.take) {
+    const pickled = make("input", { type: "checkbox", checked: Boolean(stated.allow_pickle) });
+    pickled.onchange = () => set("allow_pickle", pickled.checked);
+    if (!m || stated.allow_pickle) rows.push(make("div", { className: "guess" }, make("label", { title: "Plain arrays are taken out of it; no code of its runs" }, "Pickled", pickled)));
+    if (!m || m.format.includes("csv") || j && j.notes.some((n) => /animation|people|person/.test(n)) || stated.take) {
       const which = make("input", { type: "text", value: stated.take || "", placeholder: "name or number" });
       which.onchange = () => set("take", which.value);
       rows.push(make("div", { className: "guess" }, make("label", {}, "Take", which)));
@@ -522,10 +537,16 @@
   }
   function opens(form) {
     opened = form;
-    view.setBoxes(form && form.action.name === "chair" ? form.values.boxes : []);
+    showBoxes();
     if (form && form.action.name === "push" && !playing) pushMoment();
     timeline();
     if (form) { form.why.textContent = ""; asked = ""; askLine(form); }
+  }
+  // Boxes that are to stand there, or those on which the body was.
+  function showBoxes() {
+    const t = take(), mine = opened && opened.action.name === "chair" && opened.values.boxes.length ? opened.values.boxes : (t && t.boxes) || [];
+    view.setBoxes(mine);
+    dirty = true;
   }
   function pushMoment() {
     const m = motion(), at = Number((frame / m.fps).toFixed(3));
