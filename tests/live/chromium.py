@@ -39,7 +39,8 @@ class Page:
         while True:
             told = json.loads(self._socket.recv(timeout=60))
             if told.get("method") == "Runtime.exceptionThrown":
-                d = told["params"]["exceptionDetails"]; self.errors.append(d.get("exception", {}).get("description") or d.get("text", "?"))
+                said = told["params"]["exceptionDetails"]
+                self.errors.append(said.get("exception", {}).get("description") or said.get("text", "?"))
             if told.get("id") == self._id:
                 assert "error" not in told, told
                 return told["result"]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
-from poise.live.guard import ALL, BURST, EACH, Bucket, Guard
-from poise.live.protocol import DEPTH, MOST_BYTES, _shallow, command, parse, turned
+from poise.live.guard import ALL, BURST, DEPTH, EACH, MOST_BYTES, Bucket, Guard, _shallow, parse
+from poise.live.protocol import command, turned
 from poise.live.sources import JsonStream
 from poise.live.stream import PEOPLE, WAIT, Inbox
 from poise.motion.rotations import quat_rotate

@@ -22,9 +22,9 @@ from websockets.sync.client import connect
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live.guard import A_SECOND, EACH, Guard
+from poise.live.guard import A_SECOND, EACH, MOST_BYTES, Guard
 from poise.live.page.server import PAGES, PageServer
-from poise.live.protocol import HEAD, MOST_BYTES, LiveConfig, as_json, packed
+from poise.live.protocol import HEAD, LiveConfig, as_json, packed
 from poise.live.session import Session, SessionConfig
 from poise.live.stream import Inbox
 from refusals import refused

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from poise.live.protocol import COMMANDS, as_json, command, parse
+from poise.live.guard import parse
+from poise.live.protocol import COMMANDS, as_json, command
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox
 from test_docs import ROOT

@@ -19,11 +19,11 @@ from poise.cli.options import Flag, Json, Reading, check_range
 from poise.errors import PoiseError
 
 #: Modules that a job's process knows when it begins.
+VERBS = ("track", "push", "complete", "doctor", "convert", "retarget")
 PRELOAD = (
-    "torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.jobs.track", "poise.jobs.complete",
-    "poise.cli.track", "poise.cli.push", "poise.cli.complete", "poise.cli.doctor", "poise.cli.convert",
-    "poise.cli.retarget",
-)  # fmt: skip
+    *("torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.jobs.track"),
+    *("poise.jobs.complete", *(f"poise.cli.{verb}" for verb in VERBS)),
+)
 #: s between two lines of progress of a job.
 PROGRESS_S = 0.25
 
@@ -36,9 +36,9 @@ def run(
     browser: Flag = True,
     json: Json = False,
 ) -> Answer:
-    """Show motions in a browser, with their faults on a timeline and a button for each thing to do: mend,
-    give it a body, onto a rig, between keys, push, put a chair, export. Ctrl-C ends it; the project opens
-    again.
+    """Show motions in a browser, with their faults on a timeline and a button for each thing to do: mend
+    them, give them a body, move them onto a rig, fill between keys, push, put a chair, export. Ctrl-C
+    ends it; the project opens again.
 
     Args:
         clips: motion files; a folder that holds a project opens that.
@@ -57,7 +57,8 @@ def run(
         project, clips = clips[0], ()
     for path in clips:
         if not path.is_file():
-            what = "is a folder, and poise open shows files" if path.is_dir() else "there is no such file"
+            folder = "is a folder, and poise open shows files"
+            what = folder if path.is_dir() else "there is no such file"
             raise PoiseError(what, path, "Name motion files", code="file-missing")
     held = Project(project)
     guard = Guard(host, port, secrets.token_urlsafe(24))

@@ -1,4 +1,4 @@
-"""Clips as binary FBX 7.4: a skeleton of limb nodes and its curves, as Blender, Unreal and Maya read them."""
+"""Clips as binary FBX 7.4: a skeleton of limb nodes, and its curves."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ from poise.version import __version__
 TICKS, CM, VERSION = 46_186_158_000, 100.0, 7400
 _MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
 #: What ends a file: marks that readers look for.
-_FOOT = bytes.fromhex("fabcab09d0c8d466b1769d836eb5e22d"), bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
+_FOOT = (
+    bytes.fromhex("fabcab09d0c8d466b1769d836eb5e22d"),
+    bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b"),
+)
 #: Of keys: linear between two.
 _LINEAR = 0x4 | 0x100
 _AXES = ("X", "Y", "Z")
@@ -40,8 +43,8 @@ def write_fbx(clip: Clip, path: str | Path) -> None:
     """Writes a clip as binary FBX, in centimetres, Y up, with linear keys at the clip's own frames.
 
     Joints are limb nodes that stand in the clip's rest pose with every rotation at zero; rotations are
-    Euler angles XYZ, continuous. Joints other than the root keep their places, as in a clip. Bone tips are
-    not written, since a reader would take them for joints.
+    Euler angles XYZ, continuous. Joints other than the root keep their places, as in a clip. Bone tips
+    are not written, since a reader would take them for joints.
 
     Raises:
         PoiseError: the folder is missing or cannot be written.
@@ -54,15 +57,24 @@ def write_fbx(clip: Clip, path: str | Path) -> None:
     objects: list[_Node] = []
     links: list[tuple[str, np.int64, np.int64, str]] = []
     stack, layer = np.int64(1), np.int64(2)
-    objects.append(_Node("AnimationStack", (stack, _named("Take 001", "AnimStack"), ""), (
-        _Node("Properties70", inside=(
-            *(
-                _property(name, "KTime", "Time", "", time)
-                for kind in ("Local", "Reference")
-                for name, time in ((f"{kind}Start", times[0]), (f"{kind}Stop", times[-1]))
+    objects.append(
+        _Node(
+            "AnimationStack",
+            (stack, _named("Take 001", "AnimStack"), ""),
+            (
+                _Node(
+                    "Properties70",
+                    inside=(
+                        *(
+                            _property(name, "KTime", "Time", "", time)
+                            for kind in ("Local", "Reference")
+                            for name, time in ((f"{kind}Start", times[0]), (f"{kind}Stop", times[-1]))
+                        ),
+                    ),
+                ),
             ),
-        )),
-    )))  # fmt: skip
+        )
+    )
     objects.append(_Node("AnimationLayer", (layer, _named("BaseLayer", "AnimLayer"), "")))
     links.append(("OO", layer, stack, ""))
     for j, name in enumerate(skeleton.names):
@@ -70,7 +82,10 @@ def write_fbx(clip: Clip, path: str | Path) -> None:
         place = root[0] if j == 0 else offsets[j]
         objects += [_limb(limb, name), _model(model, name, place, turns[0, j])]
         parent = skeleton.parents[j]
-        links += [("OO", limb, model, ""), ("OO", model, np.int64(0 if parent < 0 else 1000 + 10 * parent), "")]
+        links += [
+            ("OO", limb, model, ""),
+            ("OO", model, np.int64(0 if parent < 0 else 1000 + 10 * parent), ""),
+        ]
         moving = [("R", "Lcl Rotation", turns[:, j])]
         if j == 0:
             moving.append(("T", "Lcl Translation", root))
@@ -81,19 +96,26 @@ def write_fbx(clip: Clip, path: str | Path) -> None:
                 for a, v in zip(_AXES, values[0], strict=True)
             )
             made = (_Node("Properties70", inside=defaults),)
-            objects.append(_Node("AnimationCurveNode", (number, _named(letter, "AnimCurveNode"), ""), made))
+            objects.append(
+                _Node("AnimationCurveNode", (number, _named(letter, "AnimCurveNode"), ""), made)
+            )
             links += [("OO", number, layer, ""), ("OP", number, model, what)]
             for a, axis in enumerate(_AXES):
                 objects.append(_curve(number + np.int64(1 + a), times, values[:, a]))
                 links.append(("OP", number + np.int64(1 + a), number, f"d|{axis}"))
     top = (
-        _header(), *_settings(clip.fps, times[-1]), _definitions(objects),
+        _header(),
+        *_settings(clip.fps, times[-1]),
+        _definitions(objects),
         _Node("Objects", inside=tuple(objects)),
-        _Node("Connections", inside=tuple(
-            _Node("C", (kind, a, b, *((what,) if what else ()))) for kind, a, b, what in links
-        )),
+        _Node(
+            "Connections",
+            inside=tuple(
+                _Node("C", (kind, a, b, *((what,) if what else ()))) for kind, a, b, what in links
+            ),
+        ),
         _Node("Takes", inside=(_Node("Current", ("Take 001",)),)),
-    )  # fmt: skip
+    )
     write_whole(Path(path), _file(top))
 
 
@@ -152,11 +174,14 @@ def _curve(number: np.int64, times: np.ndarray, values: np.ndarray) -> _Node:
 
 
 def _header() -> _Node:
-    return _Node("FBXHeaderExtension", inside=(
-        _Node("FBXHeaderVersion", (1003,)),
-        _Node("FBXVersion", (VERSION,)),
-        _Node("Creator", (f"Poise {__version__}",)),
-    ))  # fmt: skip
+    return _Node(
+        "FBXHeaderExtension",
+        inside=(
+            _Node("FBXHeaderVersion", (1003,)),
+            _Node("FBXVersion", (VERSION,)),
+            _Node("Creator", (f"Poise {__version__}",)),
+        ),
+    )
 
 
 def _settings(fps: float, stop: np.int64) -> tuple[_Node, ...]:
@@ -164,10 +189,16 @@ def _settings(fps: float, stop: np.int64) -> tuple[_Node, ...]:
     rows = [
         _property(name, "int", "Integer", "", value)
         for name, value in (
-            ("UpAxis", 1), ("UpAxisSign", 1), ("FrontAxis", 2), ("FrontAxisSign", 1), ("CoordAxis", 0),
-            ("CoordAxisSign", 1), ("OriginalUpAxis", 1), ("OriginalUpAxisSign", 1),
+            ("UpAxis", 1),
+            ("UpAxisSign", 1),
+            ("FrontAxis", 2),
+            ("FrontAxisSign", 1),
+            ("CoordAxis", 0),
+            ("CoordAxisSign", 1),
+            ("OriginalUpAxis", 1),
+            ("OriginalUpAxisSign", 1),
         )
-    ]  # fmt: skip
+    ]
     rows += [
         _property("UnitScaleFactor", "double", "Number", "", 1.0),
         _property("OriginalUnitScaleFactor", "double", "Number", "", 1.0),
@@ -179,7 +210,10 @@ def _settings(fps: float, stop: np.int64) -> tuple[_Node, ...]:
     ]
     document = _Node("Document", (np.int64(10), "", "Scene"), (_Node("RootNode", (np.int64(0),)),))
     return (
-        _Node("GlobalSettings", inside=(_Node("Version", (1000,)), _Node("Properties70", inside=tuple(rows)))),
+        _Node(
+            "GlobalSettings",
+            inside=(_Node("Version", (1000,)), _Node("Properties70", inside=tuple(rows))),
+        ),
         _Node("Documents", inside=(_Node("Count", (1,)), document)),
         _Node("References"),
     )
@@ -229,4 +263,5 @@ def _value(value: Any) -> bytes:
     if isinstance(value, float):
         return b"D" + struct.pack("<d", value)
     # Numbers of objects and times are wide.
-    return b"L" + struct.pack("<q", value) if isinstance(value, np.int64) else b"I" + struct.pack("<i", value)
+    wide = isinstance(value, np.integer)
+    return b"L" + struct.pack("<q", value) if wide else b"I" + struct.pack("<i", value)

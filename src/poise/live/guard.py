@@ -1,4 +1,4 @@
-"""What is let in: addresses, origins, tokens, how many connections and messages, and what is a message."""
+"""What is let in: addresses, origins and tokens, how many connections, which messages."""
 
 from __future__ import annotations
 

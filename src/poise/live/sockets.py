@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from poise.errors import PoiseError
-from poise.live.guard import EACH, Bucket
-from poise.live.protocol import MOST_BYTES, VERSION
+from poise.live.guard import EACH, MOST_BYTES, VERSION, Bucket
 from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
 

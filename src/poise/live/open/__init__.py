@@ -1,1 +1,1 @@
-"""The page of `poise open`: motions, their faults, jobs that mend them and give them a body, one project."""
+"""The page of `poise open`: motions and their faults, jobs on them, one project."""

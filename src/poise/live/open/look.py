@@ -20,13 +20,23 @@ from poise.motion.info import describe, standing_height
 from poise.motion.smoothing import find_runs
 from poise.settings import plain
 
-#: Bytes of the places that a page is sent at most; of longer motions it shows each second frame, or third.
+#: Bytes of places that a page is sent at most; of longer motions it shows each second frame, or third.
 MOST_BYTES = 96 << 20
 #: Radius of a bone by the part that begins there, m, of a person of `TALL_M`.
 RADII = {
-    "hips": 0.1, "spine": 0.1, "neck": 0.05, "head": 0.085, "clavicle": 0.05, "upper_arm": 0.046,
-    "forearm": 0.038, "hand": 0.032, "thigh": 0.072, "shin": 0.05, "foot": 0.04, "toes": 0.034,
-}  # fmt: skip
+    "hips": 0.1,
+    "spine": 0.1,
+    "neck": 0.05,
+    "head": 0.085,
+    "clavicle": 0.05,
+    "upper_arm": 0.046,
+    "forearm": 0.038,
+    "hand": 0.032,
+    "thigh": 0.072,
+    "shin": 0.05,
+    "foot": 0.04,
+    "toes": 0.034,
+}
 TALL_M, FINGER_M, OTHER_M = 1.7, 0.011, 0.02
 
 
@@ -85,7 +95,7 @@ def _carried(pos: np.ndarray, quat: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def judged(clip: Clip) -> dict[str, Any]:
-    """Faults as `poise doctor` finds them and spells that need more than a floor, guesses as `poise info`
+    """Faults as `poise doctor` finds them, spells that need more than a floor, guesses as `poise info`
     tells them, and contacts of the feet, in frames of the clip."""
     found = examine(clip)
     faults = [{**f.to_dict(), "title": KINDS[f.kind].title} for f in found.faults]
@@ -99,12 +109,19 @@ def judged(clip: Clip) -> dict[str, Any]:
         level = ground_shift(clip, support.fit.lift_m)
         faults += [
             {
-                "kind": "support missing", "joint": "", "start": n.start, "stop": n.stop,
-                "size": n.size_m, "unit": "m", "detail": n.sentence(clip.fps), "repairable": False,
+                "kind": "support missing",
+                "joint": "",
+                "start": n.start,
+                "stop": n.stop,
+                "size": n.size_m,
+                "unit": "m",
+                "detail": n.sentence(clip.fps),
+                "repairable": False,
                 "title": "rests on something that is not there",
             }
-            for n in not_alone(level, support.table) if n.kind in ("held", "leaning")
-        ]  # fmt: skip
+            for n in not_alone(level, support.table)
+            if n.kind in ("held", "leaning")
+        ]
     guesses = [g.to_dict() for g in find_guesses(clip)]
     told = " ".join(g["evidence"] for g in guesses)
     return plain(

@@ -6,7 +6,6 @@ import json
 import re
 import secrets
 import threading
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -109,9 +108,8 @@ class Project:
             PoiseError: there are too many.
         """
         if len(self.takes) >= MOST:
-            raise PoiseError(
-                f"a project holds {MOST} motions at most", self.folder, "Begin another", code="over-limit"
-            )
+            what = f"a project holds {MOST} motions at most"
+            raise PoiseError(what, self.folder, "Begin another", code="over-limit")
         path = path.absolute()
         inside = path.relative_to(self.folder) if path.is_relative_to(self.folder) else path
         number = secrets.token_hex(4)
@@ -166,8 +164,3 @@ def safe_file(name: str) -> str:
     last = re.split(r"[/\\]", name)[-1]
     kept = re.sub(r"[^\w.+()\[\] -]", "_", clean_name(last), flags=re.ASCII).strip(" .")
     return kept or "motion"
-
-
-def suffix_of(files: Iterable[str]) -> str:
-    """The suffix of the first of some names, small."""
-    return next((Path(f).suffix.lower() for f in files), "")

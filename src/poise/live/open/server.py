@@ -30,17 +30,19 @@ from poise.live.open.actions import (
     told,
     words_of,
 )
+from poise.live.open.answers import motion_of, problem_of, sentences
 from poise.live.open.project import LARGEST, Project, Take, clean_name, safe_file, write_json
 from poise.live.open.workers import Job, Workers
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, Content, WebServer
 
+SCRIPTS = ("figure", "stage_view", "timeline", "forms", "open")
 #: What can be fetched beside what belongs to takes.
 PAGES: dict[str, Asset] = {
     "/": ("live.open", "open.html", HTML),
     "/open.css": ("live.open", "open.css", CSS),
-    **{f"/{name}.js": ("live.open", f"{name}.js", JS) for name in ("figure", "stage_view", "timeline", "forms", "open")},
+    **{f"/{name}.js": ("live.open", f"{name}.js", JS) for name in SCRIPTS},
     **STAGE,
-}  # fmt: skip
+}
 #: Bytes of a message, which may be a part of a file; s between two states that a page is told.
 PART, EVERY_S = 1 << 20, 0.1
 #: Files that belong to another one and are no motion themselves; bytes of a disk that stay free.
@@ -142,27 +144,32 @@ class OpenServer:
     def _looked(self, job: Job) -> None:
         number = job.about["take"]
         self._looking[number] = self._looking.get(number, 1) - 1
-        problem = _problem(job)
+        problem = problem_of(job)
         if problem and number in self.project.takes:
             self._tell("refused", problem, number)
 
     def _worked(self, job: Job) -> None:
         about = job.about
         parent, action = self.project.takes.get(about["take"]), ACTIONS[about["action"]]
-        problem, answer = _problem(job), job.answer()
+        problem, answer = problem_of(job), job.answer()
         if job.state == "stopped":
             self._tell("stopped", f"{action.label} was stopped; nothing was changed.", about["take"])
             return
-        motion = _motion(answer.get("outputs") or {})
+        motion = motion_of(answer.get("outputs") or {})
         if problem or parent is None or motion is None:
             text = problem or f"{action.label} made no motion."
             self._tell("refused", text, about["take"])
             return
         made = self.project.add(
-            f"{parent.name} {action.makes}", motion, parent=parent.id, action=action.name,
-            line=about["line"], reading=about["reads"], says=tuple(sentences(action, answer)),
+            f"{parent.name} {action.makes}",
+            motion,
+            parent=parent.id,
+            action=action.name,
+            line=about["line"],
+            reading=about["reads"],
+            says=tuple(sentences(action, answer)),
             moment=about["moment"],
-        )  # fmt: skip
+        )
         room = self.project.room(made)
         kept = room / RESULT
         shutil.move(job.folder / RESULT, kept)
@@ -181,7 +188,7 @@ class OpenServer:
         self._tell("refused", f"What came of it could not be kept ({said}).", str(job.about.get("take")))
 
     def _exported(self, job: Job) -> None:
-        problem, target = _problem(job), Path(job.about["target"])
+        problem, target = problem_of(job), Path(job.about["target"])
         if problem or not (job.folder / target.name).exists():
             self._tell("refused", problem or "The export was stopped.", job.about["take"])
             return
@@ -191,7 +198,7 @@ class OpenServer:
         self._tell("exported", f"{target.name} lies in {target.parent}.", job.about["take"], file=number)
 
     def _rested(self, job: Job) -> None:
-        problem, found = _problem(job), job.answer().get("boxes")
+        problem, found = problem_of(job), job.answer().get("boxes")
         text = problem or ("" if found else "The motion rests on nothing but its floor.")
         self._tell("refused" if problem else "rests", text, job.about["take"], boxes=found or [])
 
@@ -220,19 +227,34 @@ class OpenServer:
         """All that the page shows but the motions themselves."""
         takes = [
             {
-                "id": t.id, "name": t.name, "parent": t.parent, "action": t.action, "line": t.line,
-                "reading": t.reading, "says": t.says, "moment": t.moment, "simulated": bool(t.result),
-                "suffix": Path(t.file).suffix.lower(), "figure": self._stamp(t, "figure.bin"),
-                "judged": self._stamp(t, "judged.json"), "looking": self._looking.get(t.id, 0) > 0,
+                "id": t.id,
+                "name": t.name,
+                "parent": t.parent,
+                "action": t.action,
+                "line": t.line,
+                "reading": t.reading,
+                "says": t.says,
+                "moment": t.moment,
+                "simulated": bool(t.result),
+                "suffix": Path(t.file).suffix.lower(),
+                "figure": self._stamp(t, "figure.bin"),
+                "judged": self._stamp(t, "judged.json"),
+                "looking": self._looking.get(t.id, 0) > 0,
                 "boxes": self._stands(t),
                 "report": bool(t.result) and (self.project.folder / t.result / "report.html").exists(),
             }
-            for t in list(self.project.takes.values()) if not t.hidden
-        ]  # fmt: skip
+            for t in list(self.project.takes.values())
+            if not t.hidden
+        ]
         return {
-            "v": VERSION, "type": "project", "folder": str(self.project.folder), "takes": takes,
-            "current": self.project.current, "jobs": self.workers.told(), "events": self._events,
-        }  # fmt: skip
+            "v": VERSION,
+            "type": "project",
+            "folder": str(self.project.folder),
+            "takes": takes,
+            "current": self.project.current,
+            "jobs": self.workers.told(),
+            "events": self._events,
+        }
 
     def _stands(self, take: Take) -> list[dict[str, Any]]:
         """What a body that did a motion stood, sat or leaned on."""
@@ -276,9 +298,13 @@ class OpenServer:
 
     async def _talk(self, connection: ServerConnection) -> None:
         hello = {
-            "v": VERSION, "type": "hello", "actions": told(), "exports": EXPORTS, "reading": READING,
+            "v": VERSION,
+            "type": "hello",
+            "actions": told(),
+            "exports": EXPORTS,
+            "reading": READING,
             "largest": LARGEST,
-        }  # fmt: skip
+        }
         with contextlib.suppress(ConnectionClosed):
             await connection.send(json.dumps(hello))
             sending = asyncio.create_task(self._send(connection))
@@ -320,7 +346,7 @@ class OpenServer:
                 await connection.send(json.dumps({"v": VERSION, **answer}))
 
     async def _upload(self, connection: ServerConnection) -> None:
-        """Takes a file in parts; the first message is its answer, the last one the take that it became."""
+        """Takes a file in parts: the first answer lets it go on, the last one names the take."""
         asked = parse_qs(urlsplit(connection.request.path if connection.request else "").query)
         name, size = asked.get("name", [""])[0], asked.get("size", [""])[0]
         problem = self._refuses(name, size)
@@ -348,10 +374,8 @@ class OpenServer:
         if not name or not size.isascii() or not size.isdigit() or len(size) > 15:
             return "A file needs a name and a size."
         if int(size) > LARGEST:
-            return (
-                f"{clean_name(name)} is larger than {LARGEST >> 30} GB. Cut the motion, or leave meshes and "
-                "textures out; or name its path: poise open FILE."
-            )
+            large = f"{clean_name(name)} is larger than {LARGEST >> 30} GB."
+            return f"{large} Cut the motion, leave meshes out, or name its path: poise open FILE."
         if shutil.disk_usage(self.project.folder).free < int(size) + FREE:
             return "The disk of the project is full. Free some space."
         return ""
@@ -404,8 +428,8 @@ class OpenServer:
                 self._run(take, message)
             case "rests":
                 args = (str(self.project.path(take)), dict(take.reading))
-                label = "Finding what it rests on"
-                self.workers.submit("work", self._runs.rests, args, self._rested, take=take.id, label=label)
+                about = {"take": take.id, "label": "Finding what it rests on"}
+                self.workers.submit("work", self._runs.rests, args, self._rested, **about)
             case "export":
                 self._export(take, str(message.get("format")))
             case _:
@@ -423,9 +447,13 @@ class OpenServer:
         moment = message.get("moment")
         moment = moment if isinstance(moment, int) and not isinstance(moment, bool) else None
         about = {
-            "take": take.id, "action": action.name, "label": action.label, "line": line,
-            "reads": self._reads(take, action), "moment": moment,
-        }  # fmt: skip
+            "take": take.id,
+            "action": action.name,
+            "label": action.label,
+            "line": line,
+            "reads": self._reads(take, action),
+            "moment": moment,
+        }
         self.workers.submit("work", self._runs.work, (words,), self._worked, **about)
 
     def _argv(self, take: Take, message: Mapping[str, Any], out: Path) -> tuple[list[str], str]:
@@ -453,7 +481,8 @@ class OpenServer:
         words = words_of(action, given, self._frames(take), files, self._boxes(take))
         onto = files.get(str(given.get("onto"))) if isinstance(given, Mapping) else None
         if action.name == "rig" and onto is None:
-            raise PoiseError("a rig is missing", hint="Drop one, or choose a motion", code="argument-missing")
+            hint = "Drop one, or choose a motion"
+            raise PoiseError("a rig is missing", hint=hint, code="argument-missing")
         suffix = suffix_for(action, self._home(take), onto)
         name = safe_file(f"{take.name} {action.makes}")
         target = str(out) if action.folder else str(out / f"motion{suffix}")
@@ -487,7 +516,8 @@ class OpenServer:
 
     def _head(self, take: Take) -> dict[str, Any]:
         """The header of what the page draws; empty before it is there."""
-        with contextlib.suppress(OSError, ValueError), (self.project.room(take) / "figure.bin").open("rb") as file:
+        path = self.project.room(take) / "figure.bin"
+        with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
             return json.loads(file.read(int.from_bytes(file.read(4), "little")))
         return {}
 
@@ -512,57 +542,6 @@ async def _received(connection: ServerConnection, part: Path, size: int) -> bool
             came += len(message)
             file.write(message)
     return True
-
-
-def _problem(job: Job) -> str:
-    """Why a job has no result, in a sentence; "" where it has one."""
-    if job.state == "crashed" or (job.state == "done" and not job.answer() and job.code):
-        how = f"signal {-job.code}" if job.code and job.code < 0 else f"code {job.code}"
-        return f"The work ended without an answer ({how}). Nothing was changed; try it again."
-    error = job.answer().get("error")
-    if not error:
-        return ""
-    what = " ".join(str(error.get(k) or "") for k in ("what",)).strip()
-    hint = str(error.get("hint") or "").strip()
-    return f"{what[:1].upper()}{what[1:]}.{f' {hint}.' if hint else ''}"
-
-
-def _motion(outputs: Mapping[str, Any]) -> Path | None:
-    """The motion among what a verb wrote."""
-    for name in ("simulated", "motion", "clip", "filled"):
-        if outputs.get(name):
-            return Path(outputs[name])
-    return None
-
-
-def sentences(action: Action, answer: Mapping[str, Any]) -> list[str]:
-    """What there is to say of a result, most important first."""
-    result, out = answer.get("result") or {}, list[str]()
-    if fixed := result.get("fixed"):
-        before, after = len(result.get("faults") or ()), len(fixed.get("faults") or ())
-        out.append(f"{before} faults before, {after} after.")
-        slide = [(r.get("figures") or {}).get("sole_slide_mm_per_s") for r in (result, fixed)]
-        if None not in slide:
-            out.append(f"Standing soles slide by {slide[1]:.0f} mm/s; it was {slide[0]:.0f}.")
-        moved = fixed.get("root_moved") or {}
-        if moved.get("max_mm", 0) >= 5:
-            out.append(f"The root moves by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}).")
-        if worse := fixed.get("worse"):
-            out.append(f"Worse than before: {', '.join(worse)}.")
-    if score := result.get("score"):
-        out.append(str(result.get("sentence") or ""))
-        if push := result.get("push"):
-            back = push.get("back_s")
-            came = "was not back at the end" if back is None else f"was back {back:.1f} s after the push"
-            out.append(f"The body gave way by {push['moved_m']:.2f} m and {came}.")
-        aid = score.get("help") or {}
-        force = aid.get("force_mean_n") or 0.0
-        out.append("Nothing helped the body: 0 N." if not force else f"Help: {force:.0f} N on average.")
-        before = (score.get("reference") or {}).get("foot_slide_mm_per_s")
-        held = ((score.get("delivered") or [{}])[0].get("delivered") or {}).get("sole_slide_mm_per_s")
-        if before is not None and held is not None:
-            out.append(f"Soles slide by {held:.0f} mm/s in what is written; the motion it follows {before:.0f}.")
-    return [*[s for s in out if s], *map(str, answer.get("notes") or ())]
 
 
 def _short(word: str, folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Jobs in processes of their own: they are queued, tell how far they are, can be stopped, and may crash."""
+"""Jobs in processes of their own: they wait, tell how far they are, can be stopped, and may crash."""
 
 from __future__ import annotations
 
@@ -58,9 +58,14 @@ class Job:
         """For the page."""
         now = time.monotonic() if self.state in ("running", "stopping") else self.began + self.spent
         return {
-            "id": self.id, "lane": self.lane, "state": self.state, "share": self.share,
-            "text": self.text, "seconds": round(now - self.began, 1) if self.began else 0.0, **self.about,
-        }  # fmt: skip
+            "id": self.id,
+            "lane": self.lane,
+            "state": self.state,
+            "share": self.share,
+            "text": self.text,
+            "seconds": round(now - self.began, 1) if self.began else 0.0,
+            **self.about,
+        }
 
     def answer(self) -> dict[str, Any]:
         """The JSON that it wrote; empty without."""
@@ -175,8 +180,8 @@ class Workers:
 
     def _room(self, lane: str) -> bool:
         with self._lock:
-            busy = [j for j in self.jobs.values() if j.lane == lane and j.state in ("running", "stopping")]
-        return len(busy) < LANES[lane]
+            busy = [j for j in self.jobs.values() if j.state in ("running", "stopping")]
+        return sum(j.lane == lane for j in busy) < LANES[lane]
 
     def _start(self, job: Job) -> None:
         job.process = self._context.Process(target=_begin, args=(job.run, job.args, str(job.folder)))
@@ -192,8 +197,8 @@ class Workers:
         if not job.process.is_alive():
             job.process.join()
             job.code = job.process.exitcode
-            state = "stopped" if job.state == "stopping" else "crashed" if job.code < 0 else "done"
-            self._over(job, state)
+            ended = "crashed" if (job.code or 0) < 0 else "done"
+            self._over(job, "stopped" if job.state == "stopping" else ended)
             return True
         return before != (job.text, job.share, job.state, int(job.told()["seconds"]))
 
