@@ -9,10 +9,11 @@ SUITE ?= engine
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
 
 .DEFAULT_GOAL := help
-.PHONY: help install dev demo live test test-all check format bench docs clean
+.PHONY: help install dev demo open live test test-all check format bench docs clean
 
 help:
 	@echo "make demo    install into $(VENV), train on a walk for $(MINUTES) minutes, write demo/"
+	@echo "make open    install into $(VENV), open the page for animators in the browser"
 	@echo "make live    install into $(VENV), show a character in the browser that can be pushed"
 	@echo "make test    run the quick tests, in minutes"
 	@echo "make test-all run every test: also of trainings, processes, browsers, docs and benchmarks"
@@ -45,6 +46,9 @@ demo: $(VENV)/.installed
 	@echo "The report:               demo/report.html (open it in a browser)"
 	@echo "The simulated motion:     demo/simulated.bvh"
 	@echo "The score card:           demo/score.json"
+
+open: $(VENV)/.installed
+	$(BIN)/poise open src/poise/data/walk.bvh
 
 live: $(VENV)/.installed
 	$(BIN)/poise live --open

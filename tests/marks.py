@@ -27,6 +27,7 @@ MARKS = {
         "test_face.py::test_importing",
     ),
     "browser": (
+        "live/test_open_browser.py",
         "live/test_page.py::test_push_fall",
         "report/test_report_browser.py",
     ),

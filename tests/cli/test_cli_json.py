@@ -73,6 +73,7 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
         "doctor": [short, "--fix", "-o", out / "o.bvh"],
         "dream": ["--seconds", "0.3", *ALONE, "--threads", "1", "--seed-clip", short, "-o", out / "o"],
         "push": [WALK, "--force", "20", "--seconds", "0.1", *ALONE, "-o", out / "o"],
+        "open": [short, "--seconds", "1", "--port", "0", "--no-browser", "-o", out / "o"],
         "live": [short, "--seconds", "1", "--port", "0", "--record", "-o", out / "o.bvh"],
     }
     return given[verb], 0

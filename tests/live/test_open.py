@@ -344,7 +344,7 @@ def test_a_foot_that_slides_is_marked_where_it_does():
     found = judged(clip.replaced(root_pos=slid))
     marks = [f for f in found["faults"] if f["kind"] == "foot slide"]
     assert marks and all(f["title"] == "slides while it stands" and f["repairable"] for f in marks)
-    # Each is that of a foot that stood somewhere in those frames; the longest goes as far as the floor did.
+    # Each is that of a foot that stood in some of those frames; the longest goes as far as the floor.
     assert all(f["start"] <= 20 and f["stop"] >= 5 for f in marks)
     assert 40 < max(f["size"] for f in marks) < 75 and {f["unit"] for f in marks} == {"cm"}
     assert found["judged"] and {g["what"] for g in found["guesses"]} >= {"up", "unit", "fps"}

@@ -84,7 +84,7 @@ def test_a_missing_package_names_the_extra(monkeypatch, make_spec):
 def test_landing_and_standing_are_those_of_the_cpu(make_spec):
     """A fall from 15 cm, the impact and two seconds of rest: the same places and contact forces.
 
-    With a round friction cone; the pyramid's edges differ for steep capsules, see docs/install.md.
+    With a round friction cone; the pyramid's edges differ for steep capsules, see docs/index.md.
     """
     config = SimConfig(cone="elliptic")
     spec = make_spec(sensors=True, config=config)

@@ -20,7 +20,7 @@ bl_info = {
     "category": "Animation",
 }
 
-_CLASSES = (panel.PoiseSettings, run.POISE_OT_run, panel.POISE_PT_panel)
+_CLASSES = (panel.PoiseSettings, run.POISE_OT_run, run.POISE_OT_open, panel.POISE_PT_panel)
 
 
 def register() -> None:

@@ -70,5 +70,6 @@ class POISE_PT_panel(bpy.types.Panel):  # noqa: N801
         row = layout.row()
         row.enabled = action is not None
         row.operator("poise.run")
+        row.operator("poise.open")
         for line in settings.told.splitlines():
             layout.label(text=line)

@@ -20,13 +20,17 @@ from . import armature, bvh
 LOST = 3
 
 
+def program_of(settings: Any) -> list[str]:
+    """The words that start Poise."""
+    program = bpy.path.abspath(settings.command)
+    # A path may hold spaces; a command with options may be given as well.
+    return [program] if Path(program).is_file() else shlex.split(program, posix=os.name != "nt")
+
+
 def command_of(settings: Any, clip: Path, out: Path, keys: Sequence[int]) -> list[str]:
     """The command line for a motion. keys: the action's keyframes, counted from its first frame."""
     stated = ["--unit", "m", "--up", "Z", "--json"]
-    program = bpy.path.abspath(settings.command)
-    # A path may hold spaces; a command with options may be given as well.
-    alone = [program] if Path(program).is_file() else shlex.split(program, posix=os.name != "nt")
-    words = [*alone, settings.verb, str(clip), "-o", str(out), *stated]
+    words = [*program_of(settings), settings.verb, str(clip), "-o", str(out), *stated]
     if settings.verb == "doctor":
         words += ["--fix"]
     else:
@@ -65,6 +69,37 @@ def told(stdout: str, stderr: str, code: int) -> str:
         left = len((result.get("fixed") or {}).get("faults", ()))
         return f"{len(result['faults'])} faults before, {left} after"
     return result.get("sentence") or answer["verb"]
+
+
+class POISE_OT_open(bpy.types.Operator):  # noqa: N801
+    """Show the action on Poise's page, in the browser; what it saves is imported with File > Import"""
+
+    bl_idname = "poise.open"
+    bl_label = "Open in Poise"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Whether an armature with an action is selected."""
+        return POISE_OT_run.poll(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Writes the action, and starts the page, whose server ends when it is closed."""
+        scene, body = context.scene, context.object
+        action, settings = body.animation_data.action, scene.poise
+        folder = Path(tempfile.mkdtemp(prefix="poise-open-"))
+        clip = folder / f"{bpy.path.clean_name(action.name)}.bvh"
+        try:
+            bvh.write(armature.motion_of(scene, body, *(round(x) for x in action.frame_range)), clip)
+            words = [*program_of(settings), "open", str(clip), "--project", str(folder / "project")]
+            words += ["--port", "0", "--once", "--unit", "m", "--up", "Z"]
+            subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        except (armature.RefusedError, OSError) as problem:
+            missing = isinstance(problem, FileNotFoundError)
+            settings.told = f"{settings.command} was not found; set Command" if missing else str(problem)
+            self.report({"ERROR"}, settings.told)
+            return {"CANCELLED"}
+        settings.told = "The page opens in the browser"
+        return {"FINISHED"}
 
 
 class POISE_OT_run(bpy.types.Operator):  # noqa: N801

@@ -66,6 +66,11 @@ def answer_of(words: Sequence[str]) -> dict[str, Any]:
     return answer
 
 
+def begin(words: Sequence[str]) -> None:
+    """Starts a verb that goes on by itself."""
+    subprocess.Popen([*command(), *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
 def _stop_if_cancelled() -> None:
     try:
         from comfy.model_management import throw_exception_if_processing_interrupted

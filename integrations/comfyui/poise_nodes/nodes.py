@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .command import answer_of, fresh, given
+from .command import answer_of, begin, fresh, given
 
 _MOTION = ("STRING", {"default": "", "tooltip": "A motion file: BVH, GLB, npz of SMPL, TRC, ..."})
 _FPS = (
@@ -14,7 +14,7 @@ _FPS = (
 )
 _SEED = ("INT", {"default": 0, "min": 0, "max": 2**31 - 1})
 CONTROLLERS = ("auto", "policy", "lookahead", "search")
-FORMATS = (".bvh", ".glb", ".npz", ".csv", ".usda")
+FORMATS = (".bvh", ".fbx", ".glb", ".npz", ".csv", ".usda")
 
 
 class _Node:
@@ -136,6 +136,27 @@ class PoiseComplete(_Node):
         return _simulated(answer_of([*words, *_reading(fps)]), out)
 
 
+class PoiseOpen(_Node):
+    """The motion on the page for animators, in the browser of this machine."""
+
+    RETURN_TYPES = ("STRING",)
+    RETURN_NAMES = ("motion",)
+    OUTPUT_NODE = True
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:  # noqa: N802
+        """See ComfyUI."""
+        return {"required": {"motion": _MOTION}, "optional": {"fps": _FPS}}
+
+    def run(self, motion: str, fps: float = 0.0) -> tuple[str]:
+        """The same path; the page opens by itself, and its server ends when it is closed."""
+        clip = given(motion)
+        project = fresh(clip, "open", ".project")
+        words = ["open", str(clip), "--project", str(project), "--port", "0", "--once"]
+        begin([*words, *_reading(fps)])
+        return (str(clip),)
+
+
 class PoiseConvert(_Node):
     """A motion as a file of another format."""
 
@@ -207,6 +228,7 @@ _NODES = {
     PoiseDoctor: "Poise: motion doctor",
     PoiseTrack: "Poise: track with a body",
     PoiseComplete: "Poise: complete keyframes",
+    PoiseOpen: "Poise: open in Poise",
     PoiseConvert: "Poise: convert",
     PoiseFromSMPL: "Poise: from SMPL parameters",
 }

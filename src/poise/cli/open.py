@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import json as json_
+import math
 import secrets
 import signal
 import sys
 import threading
+import time
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, failure, say, tell
 from poise.cli.options import Flag, Json, Reading, check_range
 from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.motion import Clip
 
 #: Modules that a job's process knows when it begins.
 VERBS = ("track", "push", "complete", "doctor", "convert", "retarget")
@@ -26,6 +32,8 @@ PRELOAD = (
 )
 #: s between two lines of progress of a job.
 PROGRESS_S = 0.25
+#: s after which a server without pages ends with --once.
+ALONE_S = 60.0
 
 
 def run(
@@ -34,7 +42,10 @@ def run(
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[int, arg(metavar="PORT")] = 8018,
     browser: Flag = True,
+    once: Flag = False,
+    seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None,
     json: Json = False,
+    reading: OmitArgPrefixes[Reading] = Reading(),
 ) -> Answer:
     """Show motions in a browser, with their faults on a timeline and a button for each thing to do: mend
     them, give them a body, move them onto a rig, fill between keys, push, put a chair, export. Ctrl-C
@@ -47,8 +58,11 @@ def run(
             token in the address.
         port: the port of the page; 0 takes a free one.
         browser: open no browser; the address is printed.
+        once: end a minute after the last page was closed.
+        seconds: end after so many seconds.
     """
     check_range("port", port, 0, 65_535)
+    check_range("seconds", seconds, 0.1)
     from poise.live.guard import LOOPBACK, Guard
     from poise.live.open.project import FILE, Project
     from poise.live.open.server import OpenServer, Runs
@@ -65,7 +79,7 @@ def run(
     server = OpenServer(held, guard, Runs(work, look, rests, PRELOAD))
     try:
         for path in reversed(clips):
-            server.add_file(path)
+            server.add_file(path, reading=stated(reading))
         (tell if json else say)(f"Poise: {server.url}", "bold")
         say(f"The project: {held.folder}")
         if host not in LOOPBACK:
@@ -73,19 +87,31 @@ def run(
         tell("Ctrl-C ends it.", "dim")
         if browser and not webbrowser.open(server.url):
             tell("No browser could be opened; open the address by hand.")
-        _until_told()
+        end = math.inf if seconds is None else time.monotonic() + seconds
+        _until_told(lambda: time.monotonic() > end or (once and server.left_s() > ALONE_S))
     finally:
         server.close()
-    return Answer({"project": str(held.folder), "motions": len(held.takes)})
+    return Answer({"motions": len(held.takes)}, {"project": held.folder / FILE})
 
 
-def _until_told() -> None:
-    """Waits for Ctrl-C, or for the system to end it."""
+def stated(reading: Reading) -> dict[str, Any]:
+    """What is stated of files, by the names of the options, as a project keeps it."""
+    held = {k: v for k, v in vars(reading).items() if v not in (None, False)}
+    return {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in held.items()}
+
+
+def _read(path: str, reading: dict[str, Any]) -> Clip:
+    paths = {k: Path(v) if k == "skeleton" else v for k, v in reading.items()}
+    return Reading(**paths).read(Path(path))
+
+
+def _until_told(over: Callable[[], bool]) -> None:
+    """Waits for Ctrl-C, for the system to end it, or until it is over."""
     done = threading.Event()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, lambda *_: done.set())
     with contextlib.suppress(KeyboardInterrupt):
-        while not done.wait(0.5):
+        while not done.wait(0.5) and not over():
             pass
 
 
@@ -108,7 +134,7 @@ def look(path: str, reading: dict[str, Any], room: str, folder: Path) -> None:
     def made() -> dict[str, Any]:
         from poise.live.open.look import write_look
 
-        write_look(Reading(**reading).read(Path(path)), Path(room))
+        write_look(_read(path, reading), Path(room))
         return {}
 
     _answered(made)
@@ -121,7 +147,7 @@ def rests(path: str, reading: dict[str, Any], folder: Path) -> None:
         from poise.live.open.look import rests_of
 
         tell("looking what it rests on")
-        return {"boxes": rests_of(Reading(**reading).read(Path(path)))}
+        return {"boxes": rests_of(_read(path, reading))}
 
     _answered(made)
 

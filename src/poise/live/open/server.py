@@ -8,6 +8,7 @@ import json
 import re
 import shlex
 import shutil
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,6 +95,7 @@ class OpenServer:
         self._event_count = 0
         self._exports: dict[str, Path] = {}
         self._looking: dict[str, int] = {}
+        self._pages, self._left = 0, 0.0
         self._stood: dict[str, list[dict[str, Any]]] = {}
         self._fresh: asyncio.Event | None = None
         self._jobs = project.folder / ".jobs"
@@ -296,6 +298,10 @@ class OpenServer:
 
     # --- doors --------------------------------------------------------------------------------
 
+    def left_s(self) -> float:
+        """s since the last page was closed; 0 while one is open, or none was yet."""
+        return time.monotonic() - self._left if self._left and not self._pages else 0.0
+
     async def _talk(self, connection: ServerConnection) -> None:
         hello = {
             "v": VERSION,
@@ -308,10 +314,12 @@ class OpenServer:
         with contextlib.suppress(ConnectionClosed):
             await connection.send(json.dumps(hello))
             sending = asyncio.create_task(self._send(connection))
+            self._pages += 1
             try:
                 await self._listen(connection)
             finally:
                 sending.cancel()
+                self._pages, self._left = self._pages - 1, time.monotonic()
 
     async def _send(self, connection: ServerConnection) -> None:
         last = ""
@@ -419,7 +427,8 @@ class OpenServer:
                 self.project.change(take.id, hidden=False)
                 self.project.current = take.id
             case "reading":
-                take = self.project.change(take.id, reading=reading_of(message.get("values")))
+                kept = {k: v for k, v in take.reading.items() if k not in READING}
+                take = self.project.change(take.id, reading=kept | reading_of(message.get("values")))
                 self.look(take)
             case "line":
                 line = self._argv(take, message, Path("OUT"))[1]

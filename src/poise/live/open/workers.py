@@ -237,8 +237,12 @@ def _said(path: Path, text: str, share: float | None) -> tuple[str, float | None
 def _begin(run: Callable[..., None], args: tuple[Any, ...], folder: str) -> None:
     """What a process does: nothing of it is printed where the server was started."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    out = os.open(Path(folder) / OUT, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    said = os.open(Path(folder) / SAID, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    try:
+        out = os.open(Path(folder) / OUT, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        said = os.open(Path(folder) / SAID, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    except OSError:
+        # The server was closed before this began.
+        return
     os.dup2(out, 1)
     os.dup2(said, 2)
     run(*args, Path(folder))

@@ -196,7 +196,8 @@
       const now = t.id === project.current;
       const name = make("button", { className: "name", type: "button", onclick: () => choose(t.id) }, t.parent ? t.name.slice(common(t)) : t.name);
       name.style.paddingLeft = `${6 + 12 * depth}px`;
-      name.title = t.line || t.name;
+      name.title = t.line ? `${t.name}: ${t.line}` : t.name;
+      name.dataset.take = t.id;
       const sub = t.looking ? "reading" : t.line ? t.line.split(" ").slice(0, 2).join(" ") : t.suffix.slice(1).toUpperCase();
       name.append(make("small", { textContent: sub }));
       const row = make("div", { className: "take" }, name);
@@ -316,7 +317,8 @@
   const unitName = (u) => { const found = UNITS.find(([k]) => Math.abs(UNIT_M[k] / u - 1) < 1e-6); return found ? found[1] : `unit ${Number(u.toPrecision(4))} m`; };
   function guesses(m, j, t) {
     const of = (what) => (j ? j.guesses.find((g) => g.what === what) : null);
-    const stated = t.reading;
+    // What only the command line can state stays.
+    const stated = Object.fromEntries(Object.entries(t.reading).filter(([k]) => k in hello.reading));
     const set = (name, value) => send({ type: "reading", take: t.id, values: { ...stated, [name]: value } });
     const one = (what, label, control) => {
       const g = of(what);

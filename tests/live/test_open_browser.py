@@ -1,0 +1,191 @@
+"""The page of `poise open` in Chromium with the jobs themselves: a motion comes in and goes out."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import CHROMIUM, Page, opened
+
+from poise.cli.open import PRELOAD, look, rests, work
+from poise.formats import read_clip, write_clip
+from poise.live.guard import Guard
+from poise.live.open.project import Project
+from poise.live.open.server import OpenServer, Runs
+from test_docs import WALK
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+    pytest.mark.timeout(900),
+]
+#: The motion that is shown, and what is known of it.
+NOW = "(poiseOpen.state.project.takes.find(t => t.id === poiseOpen.state.current) || {name: ''})"
+READY = (
+    "window.poiseOpen && poiseOpen.state.project && poiseOpen.state.motion && poiseOpen.state.judged"
+    f" && {NOW}"
+)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenServer]:
+    folder = tmp_path_factory.mktemp("animator") / "project"
+    out = OpenServer(Project(folder), Guard("127.0.0.1", 0, "word"), Runs(work, look, rests, PRELOAD))
+    yield out
+    out.close()
+
+
+@pytest.fixture(scope="module")
+def page(server: OpenServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with opened(server.url, tmp_path_factory.mktemp("profile")) as one:
+        # Small, since pictures are drawn without a GPU.
+        one.size(480, 400)
+        yield one
+        assert one.errors == []
+
+
+def drop(page: Page, *files: Path) -> None:
+    """Chooses files, as a drop does."""
+    root = page.call("DOM.getDocument")["root"]["nodeId"]
+    node = page.call("DOM.querySelector", nodeId=root, selector="#files")["nodeId"]
+    page.call("DOM.setFileInputFiles", files=[str(f) for f in files], nodeId=node)
+
+
+def shown(page: Page, name: str, seconds: float = 400.0) -> None:
+    """Waits for a motion, and that it is looked at."""
+    page.until(f"{READY}.name === {name!r} && !{NOW}.looking", seconds)
+
+
+def do(page: Page, action: str, settings: str = "") -> None:
+    """Presses a button, after its settings."""
+    page.js(f"document.querySelector('#action-{action}').open = true")
+    page.js(f"{{ const form = poiseOpen.forms().get('{action}'); {settings} }}")
+    page.js(f"document.querySelector('#action-{action} button.main:last-of-type').click()")
+
+
+def choose(page: Page, name: str) -> None:
+    """Shows another motion."""
+    number = page.js(f"poiseOpen.state.project.takes.find(t => t.name === {name!r}).id")
+    page.js(f"document.querySelector('#takes [data-take=\"{number}\"]').click()")
+    shown(page, name)
+
+
+def press(page: Page, key: str, modifiers: int = 0) -> None:
+    for kind in ("keyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers)
+
+
+def test_a_motion_is_mended_gets_a_body_is_pushed_and_goes_out(
+    server: OpenServer, page: Page, tmp_path: Path
+) -> None:
+    walk = read_clip(WALK)
+    slid = walk.root_pos.copy()
+    slid[:, :2] += np.linspace(0, 1, walk.frames)[:, None] * [0.0, 0.9]
+    source = tmp_path / "video.bvh"
+    write_clip(walk.replaced(root_pos=slid), source)
+    before = source.read_bytes()
+    drop(page, source)
+    shown(page, "video")
+    kinds = page.js("[...new Set(poiseOpen.state.judged.faults.map(f => f.kind))]")
+    assert "foot slide" in kinds
+    # A mark leads to the frame, and marks its range.
+    page.js(
+        "[...document.querySelectorAll('#faults button')].find(b => b.title.includes('slides')).click()"
+    )
+    fault = page.js("poiseOpen.state.judged.faults[poiseOpen.state.fault]")
+    assert page.js("poiseOpen.state.frame") == fault["start"]
+    assert page.js("poiseOpen.state.joint") == fault["joint"]
+    do(page, "mend")
+    shown(page, "video mended")
+    assert len(page.js("poiseOpen.state.judged.faults")) < 4
+    assert "faults before" in page.js("document.querySelector('#says').innerText")
+    # Undo shows what came in, and does it again.
+    press(page, "z", 2)
+    shown(page, "video")
+    press(page, "z", 2 | 8)
+    shown(page, "video mended")
+    do(page, "body", "form.set('controller', 'policy'); form.set('pins', [['left_hand', 40, 50]])")
+    shown(page, "video mended with a body")
+    assert "Nothing helped the body: 0 N." in page.js("document.querySelector('#says').innerText")
+    choose(page, "video mended")
+    page.js("poiseOpen.seek(30)")
+    do(page, "push", "form.set('force', 60); form.set('seconds', 0.2); form.set('controller', 'policy')")
+    shown(page, "video mended pushed")
+    assert "--at chest --force 60 --from 1 --seconds 0.2" in page.js(f"{NOW}.line")
+    assert page.js("poiseOpen.state.compare") == page.js(f"{NOW}.parent")
+    page.js("document.getElementById('export').click()")
+    page.until("document.getElementById('toast').textContent.includes('lies in')", 60)
+    out = server.project.folder / "exports" / "video mended pushed.bvh"
+    take = server.project.takes[page.js("poiseOpen.state.current")]
+    made, again = (read_clip(p, unit_m=0.01, up_axis="Y") for p in (server.project.path(take), out))
+    assert again.skeleton.names == walk.skeleton.names and again.frames == walk.frames
+    np.testing.assert_allclose(again.positions(), made.positions(), atol=1e-4)
+    assert source.read_bytes() == before
+    python = os.environ.get("POISE_BPY_PYTHON") or sys.executable
+    if "POISE_BPY_PYTHON" in os.environ or importlib.util.find_spec("bpy"):
+        script = (
+            "import bpy, sys; bpy.ops.import_anim.bvh(filepath=sys.argv[1], global_scale=0.01); "
+            + (
+                "o = bpy.context.object; bpy.context.scene.frame_set(31); "
+                "print(*(o.matrix_world @ o.pose.bones['Head'].matrix).translation)"
+            )
+        )
+        told = subprocess.run(
+            [python, "-c", script, str(out)], capture_output=True, text=True, check=True, timeout=240
+        )
+        shown_there = [float(x) for x in told.stdout.split("\n")[-2].split()]
+        head = again.positions()[30, walk.skeleton.names.index("Head")]
+        np.testing.assert_allclose(shown_there, head, atol=1e-3)
+
+
+def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: Page) -> None:
+    """Frames that stay are marked by hand, the page goes on drawing, and Stop stops."""
+    choose(page, "video mended")
+    for frame in (0, 40, 85):
+        page.js(f"poiseOpen.seek({frame})")
+        press(page, "s")
+    assert page.js("poiseOpen.forms().get('between').values.keyframes") == [0, 40, 85]
+    do(page, "between")
+    page.until("document.body.dataset.busy === 'yes'")
+    press(page, " ")
+    page.until("poiseOpen.state.playing")
+    time.sleep(2.0)
+    moved = page.js("poiseOpen.state.frame")
+    page.until(f"poiseOpen.state.frame !== {moved}", 5)
+    page.until("[...document.querySelectorAll('#jobs button')].some(b => b.textContent === 'Stop')", 60)
+    page.js("document.querySelector('#jobs button').click()")
+    page.until("document.body.dataset.busy === 'no'", 60)
+    assert not [t for t in server.project.takes.values() if t.action == "between"]
+    press(page, "k")
+
+
+def test_names_and_places_of_the_controls(page: Page) -> None:
+    """Each control has a name for screen readers, and lies within the window."""
+    page.size(1280, 720)
+    nameless = page.js(
+        """[...document.querySelectorAll('button, select, input, canvas[tabindex], progress')].filter(
+        e => e.offsetParent && !(e.getAttribute('aria-label') || e.textContent.trim() || e.title
+        || (e.labels || []).length)).map(e => e.outerHTML)"""
+    )
+    assert nameless == []
+    assert page.js("document.documentElement.scrollWidth") == 1280
+    for side in ("aside", "nav"):
+        name = f"document.querySelector('{side}')"
+        assert page.js(f"{name}.scrollWidth - {name}.clientWidth") == 0
+    cut = page.js(
+        """[...document.querySelectorAll('header > *, #transport > *')].filter(e => {
+        const b = e.getBoundingClientRect();
+        return e.offsetParent && (b.right > innerWidth || b.bottom > innerHeight);
+        }).map(e => e.outerHTML)"""
+    )
+    assert cut == []
+    dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+    light = page.js("getComputedStyle(document.body).backgroundColor")
+    page.call("Emulation.setEmulatedMedia", features=dark)
+    assert page.js("getComputedStyle(document.body).backgroundColor") != light
