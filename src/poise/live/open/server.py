@@ -501,7 +501,10 @@ class OpenServer:
         shown = [*words, *more, *read]
         shown = [_short(w, self.project.folder) for w in shown]
         named = name if action.folder else f"{name}{suffix}"
-        return argv, shlex.join(["poise", action.verb, Path(path).name, *shown, "-o", named])
+        came = Path(path)
+        # What was made here bears the name of its motion for people.
+        read_from = safe_file(f"{source.name}{came.suffix}") if source.parent else came.name
+        return argv, shlex.join(["poise", action.verb, read_from, *shown, "-o", named])
 
     def _reads(self, take: Take, action: Action) -> dict[str, Any]:
         """How what a button writes is read: a BVH does not say its unit nor its vertical."""
