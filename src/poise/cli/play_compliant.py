@@ -81,7 +81,7 @@ def run(
         level: level of compliance; by default 0.16, or for the ball a stiffness.
         stiffness: give way as a spring of so many newtons per metre in place of --level.
         lag: how fast it gives way with --stiffness: the time constant. Held hands need a slow one.
-        count: episodes, side by side, that begin a hair apart; the report shows the first.
+        count: episodes, side by side, whose starts differ; the report shows the first.
         newtons: pull: how hard (20).
         direction: pull: where to, Z up (0,1,0).
         side: pull, hands: which hand (left).
@@ -171,7 +171,7 @@ def run(
             "no browser could be opened", paths["report"], "Open the page by hand", code="no-browser"
         )
     result = {"scene": scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
-    return Answer(result, paths, () if given is None else given.notes)
+    return Answer(result, paths, (*played.notes, *(() if given is None else given.notes)))
 
 
 def given_of(level: float | None, stiffness: float | None, lag: float) -> Compliance | Stiffness | None:

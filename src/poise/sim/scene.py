@@ -28,6 +28,8 @@ from poise.sim.props import Prop
 
 #: Things in one scene; more take minutes to compile and are a mistake.
 MOST = 500
+#: Impedance d of contacts between two characters, see MuJoCo's `solimp`.
+FLESH = 0.5
 _BITS = ("FOUND", "FORCE", "TORQUE", "POS")
 _DATA = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{bit}")) for bit in _BITS)
 _NETFORCE = 3
@@ -116,6 +118,8 @@ class Scene:
                 add_humanoid(spec, thing.humanoid.table, thing.prefix)
             else:
                 thing.add(spec)
+        if len(characters) > 1:
+            _soften(spec, characters)
         known = [b.name for b in spec.bodies]
         for link in self.links:
             for body in (link.a, link.b):
@@ -191,6 +195,21 @@ class Scene:
 def alone(humanoid: Humanoid, sim: SimConfig | None = None) -> mujoco.MjModel:
     """The model of a world with a body and a plane floor, and nothing else."""
     return Scene((Character(humanoid),), sim=sim or SimConfig()).compile().model
+
+
+def _soften(spec: mujoco.MjSpec, characters: tuple[Character, ...]) -> None:
+    """Gives contacts between bodies of characters the impedance `FLESH`; all others keep their own.
+
+    A limb that is wedged between two of another character has contacts that push against each other. The
+    solver shares d / (1 - d) of what both ask for among them: 9 to 19 times with MuJoCo's d, up to
+    200,000 N between two people, and once with a half.
+    """
+    for character in characters:
+        for name in character.humanoid.bodies:
+            for geom in spec.body(character.prefix + name).geoms:
+                # Parameters of a pair are mixed by weight, and 0 against anything counts nothing.
+                geom.solmix = 0.0
+                geom.solimp[:2] = [FLESH, FLESH]
 
 
 def _check(name: str, known: list[str], where: str) -> None:

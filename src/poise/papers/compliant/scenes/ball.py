@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import mujoco
 import torch
@@ -23,7 +23,8 @@ from poise.env.scene import InScene, RandomEvent, Switch, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
-from poise.papers.compliant.scenes.stage import Given, SceneSetup
+from poise.papers.compliant.scenes.stage import LINKED, Given, SceneSetup
+from poise.score import Spread
 from poise.settings import Checked, Positive, Range, validate
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
 from poise.sim.props import Vector, solid
@@ -93,6 +94,9 @@ class Balance:
         pushes: N, of a push at the chest for 0.1 s every 2 to 3 s from all around; 0 is none.
         seed: of the draws.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = LINKED
 
     length: Annotated[float, Range(0.1, 5, unit="m")] = 1.0
     spread: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.02

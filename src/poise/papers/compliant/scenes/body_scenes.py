@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -21,7 +21,16 @@ from poise.env.pushes import Push
 from poise.env.reference import Reference
 from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
 from poise.errors import PoiseError
-from poise.papers.compliant.scenes.stage import Given, SceneSetup, as_given, hand_of
+from poise.papers.compliant.scenes.stage import (
+    CONTACTS_HZ,
+    LINKED,
+    STARTS,
+    Given,
+    SceneSetup,
+    as_given,
+    hand_of,
+)
+from poise.score import Spread
 from poise.settings import Checked, Positive, Range, validate
 from poise.sim import Drive, Link, Plane, SceneSim, Touch
 from poise.sim.props import Ball, Box, Carrier, Vector, solid
@@ -40,6 +49,9 @@ class HandInHand:
         sway: m, to either side.
         every_s: s, the time of a swing.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = LINKED
 
     side: Literal["left", "right"] = "left"
     lead: Annotated[float, Range(-10, 10, above=True, below=True, unit="m/s")] = 0.0
@@ -103,6 +115,9 @@ class Chicken:
         seed: of the draws.
     """
 
+    rate_hz: ClassVar[float | None] = CONTACTS_HZ
+    starts: ClassVar[Spread] = STARTS
+
     mass: Annotated[float, Range(2, 500, unit="kg")] = HEAVY_KG
     other: Annotated[float, Range(2, 500, unit="kg")] = LIGHT_KG
     against: Literal["bag", "rival"] = "bag"
@@ -117,15 +132,17 @@ class Chicken:
         name = "bag" if self.against == "bag" else RIVAL
         touches = touches_of("felt", name, humanoid.bodies)
         felt = tuple(t.name for t in touches)
+        hit = Touch("hit", name, "character")
+        touches = (*touches, hit)
         if self.against == "rival":
-            return SceneSetup((), (), touches, (InScene(felt=felt),), from_start=True)
+            part = InScene(metered=(hit.name,), felt=felt)
+            return SceneSetup((), (), touches, (part,), from_start=True)
         chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
         bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other)
-        return SceneSetup(
-            (bag,), (), touches, (InScene(felt=felt, events=(far, throw)),), from_start=True
-        )
+        part = InScene(metered=(hit.name,), felt=felt, events=(far, throw))
+        return SceneSetup((bag,), (), touches, (part,), from_start=True)
 
 
 def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
@@ -155,6 +172,9 @@ class PullScene:
         start_s: s, when it begins.
         lasts_s: s, for how long.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = STARTS
 
     newtons: Annotated[float, Range(0, 1e4, above=True, below=True, unit="N")] = 20.0
     side: Literal["left", "right"] = "left"
@@ -187,6 +207,9 @@ class Throws:
         every_s: s between throws, drawn between.
         seed: of the draws.
     """
+
+    rate_hz: ClassVar[float | None] = CONTACTS_HZ
+    starts: ClassVar[Spread] = STARTS
 
     mass: Annotated[float, Range(0, 100, above=True, below=True, unit="kg")] = 1.0
     speed: Annotated[tuple[float, float], Range(0, above=True, rising=True, unit="m/s")] = (2.0, 3.0)
@@ -283,6 +306,9 @@ class TrampolineScene:
         height: m, by which the actuators rise for a bounce.
         first: s, when the first bounce begins.
     """
+
+    rate_hz: ClassVar[float | None] = CONTACTS_HZ
+    starts: ClassVar[Spread] = STARTS
 
     height: Annotated[float, Range(0, 1, unit="m")] = 0.15
     first: Annotated[float, Range(0, EVERY_S, below=True, unit="s")] = 1.0

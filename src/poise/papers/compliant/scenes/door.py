@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,7 +17,8 @@ from poise.env.reference import Reference
 from poise.env.scene import InScene, ScenePart, SetDown
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
-from poise.papers.compliant.scenes.stage import SceneSetup, hand_of
+from poise.papers.compliant.scenes.stage import STARTS, SceneSetup, hand_of
+from poise.score import Spread
 from poise.settings import Range, validate
 from poise.sim import Drive, Link, SceneSim
 from poise.sim.props import Door
@@ -50,6 +51,9 @@ class DoorScene:
         made_for: m, how wide the door is for which the motion is made; None: this one. The paper has its
             character learn at 1 m and try up to 1.7.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = STARTS
 
     width: Annotated[float, Range(0, 10, above=True, below=True, unit="m")] = 1.0
     weight: Annotated[float, Range(0, 1000, above=True, below=True, unit="kg")] = 20.0
