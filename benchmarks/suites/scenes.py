@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
-from benchmarks.common.clips import WALK, Places
+from benchmarks.common.clips import WALK, Places, moment
 from benchmarks.common.rows import Figure, of, short
 from benchmarks.common.runner import Part, Raws
 from poise.control import Compliance, Stiffness
@@ -27,9 +27,10 @@ from poise.env.pushes import Pushes
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
+from poise.motion import Clip
 from poise.papers.compliant.figures import measure, slope, throws
-from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
-from poise.papers.compliant.scene_play import COUNTS, play
+from poise.papers.compliant.motions import motion_of, standing
+from poise.papers.compliant.scene_play import COUNTS, Played, play
 from poise.papers.compliant.scene_training import shipped
 from poise.papers.compliant.scenes import (
     Balance,
@@ -233,9 +234,16 @@ DOORS = {
     else DoorScene(1.0)
     for w, m in ((1.0, None), (1.35, None), (1.7, None), (1.35, 1.0), (1.7, 1.0))
 }
+RUN = "other/bandai_bvh/dataset-1_run_normal_001.bvh"
 #: Scenes, what gives way beside the twin that does not, s, episodes.
 SCENES: dict[str, Case] = {
     "hand in hand, walking": (
+        HandInHand(),
+        ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
+        8.0,
+        32,
+    ),
+    "hand in hand, running": (
         HandInHand(),
         ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
         8.0,
@@ -266,16 +274,16 @@ def played(places: Places, unit: str) -> Any:
         ways, seconds, many = ways[:1], 1.0, 1
     tracker = policy()
     clip = read_clip(WALK) if unit.endswith("walking") else None
+    if unit.endswith("running"):
+        clip = moment() if places.smoke else read_clip(places.data / RUN)
     out: dict[str, Any] = {"episodes": many}
     for way in ways:
         own = shipped("ball", tracker) if way == "learned" else None
         how = {} if not seconds else {"seconds": seconds}
         made = play(scene, tracker, clip, WAY.get(way), many, threads=1, learned=own, **how)
         out["without"], out[way] = told(made.stiff_episodes), told(made.episodes)
-    if isinstance(scene, Chicken):
-        touch = next((i for i, arrows in enumerate(made.arrows) if len(arrows)), 0)
-        at = touch / made.evaluation.rollouts.fps
-        out["nobody touches"] = nobody(tracker, scene, at, many, seconds)
+    if not isinstance(scene, Balance):
+        out["nobody touches"] = nobody(tracker, scene, clip, made, many, seconds)
     return out
 
 
@@ -312,19 +320,23 @@ def interval(values: list[float], name: str) -> str:
 
 
 def nobody(
-    tracker: Tracker, scene: Chicken, touch_s: float, many: int, seconds: float
-) -> dict[str, Any]:
-    """How far the pelvis leaves its way in the same half second where nobody touches the player."""
-    clip = hopping(tracker, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
-    alone = play(Throws(every_s=(100.0, 100.0)), tracker, clip, None, many, seconds, 1)
-    rolled = alone.evaluation.rollouts
-    off = (rolled.pos - rolled.ref_pos)[:, :, 0, :2]
-    first = min(round(touch_s * rolled.fps), off.shape[1] - 2)
-    last = min(first + round(PUSHED_S * rolled.fps), off.shape[1] - 1)
-    return {
-        "pushed_mm": (1000.0 * (off[:, last] - off[:, first]).norm(dim=-1)).tolist(),
-        "lost": told(alone.stiff_episodes)["lost"],
-    }
+    tracker: Tracker, scene: PlayScene, clip: Clip | None, made: Played, many: int, seconds: float
+) -> dict[str, list[float | None]]:
+    """The same motion from the same starts on a floor where nobody comes: steps, losses, distance,
+    torque. Of a fight also how far the pelvis leaves its way in the half second of the first touch."""
+    own = motion_of(scene, tracker, seconds) or clip
+    free = Throws(every_s=(100.0, 100.0))
+    alone = play(free, tracker, own, None, many, seconds or own.seconds if own else seconds, 1)
+    every = told(alone.stiff_episodes)
+    out = {k: every[k] for k in ("steps", "lost", "off_m", "torque_nm")}
+    if isinstance(scene, Chicken):
+        rolled = alone.evaluation.rollouts
+        touch = next((i for i, arrows in enumerate(made.arrows) if len(arrows)), 0)
+        off = (rolled.pos - rolled.ref_pos)[:, :, 0, :2]
+        first = min(touch, off.shape[1] - 2)
+        last = min(first + round(PUSHED_S * rolled.fps), off.shape[1] - 1)
+        out["pushed_mm"] = (1000.0 * (off[:, last] - off[:, first]).norm(dim=-1)).tolist()
+    return out
 
 
 # --- cost -----------------------------------------------------------------------------------------
@@ -365,7 +377,7 @@ PARTS = {
             scene_rows,
             kinds,
             hours=hours,
-            needs=(),
+            needs=("data",) if name == "hands" else (),
         )
         for name, begins, kinds, hours in (
             ("hands", "hand in hand", _SHIPS, 0.3),
