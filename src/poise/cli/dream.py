@@ -22,7 +22,7 @@ from poise.cli.options import (
     lookahead_of,
     places,
 )
-from poise.cli.settings import named_options
+from poise.cli.recipe_options import named_options
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write

@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, say, tell
 from poise.cli.options import Flag, Json, OpenPage, PolicyFile, Reading, check_range
-from poise.cli.settings import named_options
+from poise.cli.recipe_options import named_options
 from poise.cli.training import working
 from poise.errors import PoiseError
 

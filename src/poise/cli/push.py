@@ -21,7 +21,7 @@ from poise.cli.options import (
     check_range,
     places,
 )
-from poise.cli.settings import named_options
+from poise.cli.recipe_options import named_options
 from poise.cli.training import working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver

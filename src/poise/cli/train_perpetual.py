@@ -15,7 +15,7 @@ from poise.cli import training as progress
 from poise.cli.console import Answer, launched, notes, say, table, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Flag, Training
-from poise.cli.settings import SOURCES, configured, derived, given, stated
+from poise.cli.recipe_options import SOURCES, configured, derived, given, stated
 from poise.cli.training import beginning, clock, held_already, left, showing, stopped
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed

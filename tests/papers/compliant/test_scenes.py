@@ -13,7 +13,7 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.control import Compliance, Stiffness
 from poise.env.pushes import Push
-from poise.env.scene import InScene, ScenePart
+from poise.env.scene_events import InScene, ScenePart
 from poise.env.yielding import DisplacedGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run

@@ -19,7 +19,7 @@ from poise.env.env import ImitationEnv
 from poise.env.events import EpisodeStart, Event
 from poise.env.frame import Frame, Observable
 from poise.env.goal import Goal
-from poise.env.scene import InScene, touches_of
+from poise.env.scene_events import InScene, touches_of
 from poise.env.task import Acts, EnvStep
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError

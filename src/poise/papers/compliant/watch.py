@@ -15,9 +15,9 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.events import Felt, Force
-from poise.env.scene import ScenePart
+from poise.env.scene_events import ScenePart
 from poise.env.yielding import DisplacedGoal
-from poise.jobs.track.controllers import RULE
+from poise.jobs.result import RULE
 from poise.kinematics import lowest_height
 from poise.metrics import success_rule
 from poise.papers.compliant.figures import FALLEN, TOUCHES_N

@@ -19,7 +19,7 @@ from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
 from poise.env.pushes import Pushes
 from poise.env.reference import Reference
-from poise.env.scene import InScene, RandomEvent, Switch, near
+from poise.env.scene_events import InScene, RandomEvent, Switch, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate

@@ -19,7 +19,7 @@ from poise.body.humanoid import make_humanoid
 from poise.env.events import EpisodeStart, Event
 from poise.env.pushes import Push
 from poise.env.reference import Reference
-from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
+from poise.env.scene_events import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
 from poise.errors import PoiseError
 from poise.papers.compliant.scenes.stage import Given, SceneSetup, as_given, hand_of
 from poise.settings import Checked, Positive, Range, validate

@@ -14,7 +14,7 @@ from poise.body import Humanoid
 from poise.env.events import EpisodeStart, Event
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
-from poise.env.scene import InScene, ScenePart, SetDown
+from poise.env.scene_events import InScene, ScenePart, SetDown
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
 from poise.papers.compliant.scenes.stage import SceneSetup, hand_of

@@ -83,7 +83,7 @@ def ends_on(sim: SceneSim, rows: CharacterRows, name: str) -> list[End]:
     for body, sign in _ends(sim, name, touch):
         for k, place in enumerate(rows.places):
             if touch is not None and body == place.name:
-                hint = "Touch its bodies one by one, see poise.env.scene.touches_of"
+                hint = "Touch its bodies one by one, see poise.env.scene_events.touches_of"
                 raise PoiseError(
                     f"touch '{name}' does not say which body is touched",
                     "InScene",
