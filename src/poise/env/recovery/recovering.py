@@ -1,7 +1,7 @@
 """A goal that is come back to: a character that has lost it falls, rests, and follows a recovery motion.
 
 PHC tells a fallen or far character nothing but a point to come back to (`env.recovery.clock`). A
-recovery motion says how: it is planned (`env.recovery.get_up`) from clips that get up and clips that
+recovery motion says how: it is planned (`env.recovery.planner`) from clips that get up and clips that
 walk, when it is needed, and is tracked like any other motion. So the policy that tracks a library also
 recovers, and needs no other goal, reward or network for it.
 """
