@@ -24,7 +24,7 @@ from poise.cli.options import (
     check_range,
     places,
 )
-from poise.cli.recipe_options import TRACK, derived, given, named_options
+from poise.cli.recipe_options import TRACK, derived, given
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -100,8 +100,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.synthesis.filler import check_keyframes
     from poise.synthesis.keyframes import partials_of, times_of
 
-    with named_options("TrackConfig"):
-        config = TrackConfig(**given(o.tracking), **o.directing.values())
+    config = TrackConfig(**given(o.tracking), **o.directing.values())
     times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)
     keys = tuple(range(clip.frames)) if every else keys
