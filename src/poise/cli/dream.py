@@ -22,7 +22,6 @@ from poise.cli.options import (
     lookahead_of,
     places,
 )
-from poise.cli.settings import named_options
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -95,21 +94,20 @@ def run(
     from poise.jobs.open import open_run
 
     ahead = lookahead_of(budget)
-    with named_options("Dream"):
-        config = Dream(
-            temperature=temperature,
-            count=count,
-            targets=targets,
-            seed=seed,
-            controller=controller,
-            lookahead=ahead,
-            recover=recover,
-            past=past,
-            style=style,
-            label_seconds=label_seconds,
-            hold_feet=hold_feet,
-            threads=threads,
-        )
+    config = Dream(
+        temperature=temperature,
+        count=count,
+        targets=targets,
+        seed=seed,
+        controller=controller,
+        lookahead=ahead,
+        recover=recover,
+        past=past,
+        style=style,
+        label_seconds=label_seconds,
+        hold_feet=hold_feet,
+        threads=threads,
+    )
     files = names_of(motion or folder / "simulated.bvh", count)
     for file in files:
         may_write(file, force, *read)

@@ -40,7 +40,9 @@ def run(
     clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
     duration: Annotated[float, arg(metavar="SECONDS")] = 8.0,
     level: Annotated[float | None, arg(metavar="0-1", help_behavior_hint="")] = None,
-    stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None,
+    newtons_per_metre: Annotated[
+        float | None, arg(name="stiffness", metavar="N/M", help_behavior_hint="")
+    ] = None,
     lag: Annotated[float, arg(metavar="SECONDS")] = 0.5,
     count: Annotated[int, arg(metavar="N")] = 16,
     newtons: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None,
@@ -79,7 +81,7 @@ def run(
         clip: what the character does; by default it stands.
         duration: how long it stands.
         level: level of compliance; by default 0.16, or for the ball a stiffness.
-        stiffness: give way as a spring of so many newtons per metre in place of --level.
+        newtons_per_metre: give way as a spring of so many newtons per metre in place of --level.
         lag: how fast it gives way with --stiffness: the time constant. Held hands need a slow one.
         count: episodes, side by side, whose starts differ; the report shows the first.
         newtons: pull: how hard (20).
@@ -136,11 +138,11 @@ def run(
         "against": against,
         "seed": seed,
     }
-    place, given = scene_of(scene, stated), given_of(level, stiffness, lag)
+    place, given = scene_of(scene, stated), given_of(level, newtons_per_metre, lag)
     motion = None if clip is None else reading.read(clip)
     with working("opening the policy"):
         tracker = open_run(policy).tracker
-        chosen = level is not None or stiffness is not None
+        chosen = level is not None or newtons_per_metre is not None
         if learned is None:
             alone = chosen or controller == "lookahead"
             knows = None if alone else shipped(scene, tracker)

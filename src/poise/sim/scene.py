@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated
 
 import mujoco
@@ -20,6 +21,7 @@ import mujoco
 from poise.body import Humanoid
 from poise.body.humanoid import add_humanoid
 from poise.errors import PoiseError, did_you_mean
+from poise.formats.text import write_whole
 from poise.settings import Length, validate
 from poise.sim.backend import SimConfig
 from poise.sim.floor import Floor, Plane
@@ -242,3 +244,23 @@ class SceneModel:
             hint = did_you_mean(name, list(self.places))
             raise PoiseError(f"there is no '{name}' in the scene", "Scene", hint, code="unknown-thing")
         return self.places[name]
+
+
+def mjcf_of(humanoid: Humanoid, sim: SimConfig | None = None) -> str:
+    """A body as MJCF: on a floor, a position servo for every hinge, the settings of the physics.
+
+    `ctrl` are target angles in rad; lengths are m, masses kg, the vertical is Z. MuJoCo writes numbers
+    with six digits, so that the loaded model differs from the simulated one by 1e-6 of each.
+
+    sim: the physics; by default those of the recipes. A control step is `sim.substeps` of MuJoCo's.
+    """
+    spec = Scene((Character(humanoid),), sim=sim or SimConfig()).spec
+    # What is written is complete only after it was compiled.
+    spec.compile()
+    return spec.to_xml()
+
+
+def write_mjcf(humanoid: Humanoid, path: str | Path, sim: SimConfig | None = None) -> Path:
+    """Writes `mjcf_of` into a file, whole or not at all."""
+    write_whole(Path(path), mjcf_of(humanoid, sim))
+    return Path(path)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from poise.body import BodyTable, Humanoid
-from poise.env.generator import Steering
+from poise.env.generator_goal import Steering
 from poise.errors import PoiseError
 from poise.formats import check_writable, write_clip
 from poise.formats.text import write_whole

@@ -22,11 +22,12 @@ from poise.env import ImitationEnv
 from poise.errors import PoiseError
 from poise.formats import write_clip
 from poise.formats.text import write_whole
-from poise.jobs.deliver import make_report, simulated_clip
+from poise.jobs.deliver import Evaluation, make_report, simulated_clip
 from poise.jobs.open import open_run
-from poise.jobs.runs import Evaluation, scored
+from poise.jobs.result import RULE
+from poise.jobs.runs import scored
 from poise.jobs.track import imitation_of
-from poise.jobs.track.controllers import RULE, look_ahead
+from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip

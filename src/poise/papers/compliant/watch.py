@@ -14,16 +14,16 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.events import Felt, Force
-from poise.env.scene import ScenePart
+from poise.env.scene_events import ScenePart
 from poise.env.yielding import DisplacedGoal
-from poise.jobs.track.controllers import RULE
+from poise.jobs.result import RULE
 from poise.kinematics import lowest_height
 from poise.metrics import success_rule
 from poise.papers.compliant.figures import FALLEN, TOUCHES_N
-from poise.papers.compliant.opponents import Opposing
+from poise.papers.compliant.opponents import Opponent
 from poise.papers.compliant.scenes import Balance, Chicken, DoorScene, PlayScene, TrampolineScene
 from poise.papers.compliant.scenes.ball import COS_45, upright_of
-from poise.papers.compliant.scenes.body_scenes import Bouncing
+from poise.papers.compliant.scenes.body_scenes import Bounce
 from poise.papers.compliant.scenes.door import WANTED, across
 from poise.recipes.imitation import Imitation
 from poise.score.report import Mover, Shape
@@ -238,7 +238,7 @@ class TrampolineMeter:
 
     def begin(self, env: ImitationEnv) -> None:
         part = part_of(env)
-        self._bounce = next(h for h in part.events if isinstance(h, Bouncing))
+        self._bounce = next(h for h in part.events if isinstance(h, Bounce))
         self._sim, self._mechanics = part.sim, Mechanics(env.backend)
         self._feet = list(env.goal.humanoid.feet)
         n = env.num_envs
@@ -265,7 +265,7 @@ class TrampolineMeter:
         energy = kinetic + env.goal.humanoid.mass * G * (com - self._com)
         self._joules += torch.where(lands, energy, 0.0)
         self._steps += lands
-        if step / env.goal.rate_hz > self._bounce.first_s:
+        if step / env.goal.rate_hz > self._bounce.first:
             height = self._sim.backend.state.qpos[:, self._sim.scene.place("trampoline").qpos.start]
             self._plate = torch.maximum(self._plate, torch.stack((height, -height)).double())
 
@@ -318,7 +318,7 @@ class ChickenMeter:
 
     def begin(self, env: ImitationEnv) -> None:
         self._part = part_of(env)
-        opposing = env.event(Opposing)
+        opposing = env.event(Opponent)
         self._envs = [env] if opposing is None else [env, opposing.env]
         n = env.num_envs
         self._left = torch.full((n,), -1, dtype=torch.long)

@@ -16,10 +16,20 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.env.events import EpisodeStart, Event
+from poise.env.events import EpisodeStart
 from poise.env.pushes import Push
 from poise.env.reference import Reference
-from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
+from poise.env.scene_events import (
+    InScene,
+    Move,
+    SceneEvent,
+    ScenePart,
+    SetDown,
+    Switch,
+    Throw,
+    always,
+    touches_of,
+)
 from poise.errors import PoiseError
 from poise.papers.compliant.scenes.stage import (
     CONTACTS_HZ,
@@ -341,13 +351,16 @@ def stands_still(given: Given | None) -> Given:
 
 def after_contact(part: ScenePart, force: Tensor) -> Tensor:
     """A force where the character gives way just now, else 0."""
-    bounce = next(h for h in part.events if isinstance(h, Bouncing))
+    bounce = next(h for h in part.events if isinstance(h, Bounce))
     return force * (bounce.gives > 0).to(force).unsqueeze(1)
 
 
-@dataclass(frozen=True)
-class Bounce:
+@dataclass
+class Bounce(SceneEvent):
     """A plate's actuators rise for a moment, every 3 s.
+
+    At work it counts, each `(N,)`, `steps`, control steps since the episode began, and `gives`, those
+    for which the character gives way yet; `air` is 1 where the feet have left the plate.
 
     Attributes:
         plate: its name.
@@ -361,25 +374,9 @@ class Bounce:
     touches: tuple[str, ...]
     first: float = 1.0
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return Bouncing(self, sim, control_hz)
-
-
-class Bouncing(Event):
-    """`Bounce` in N worlds.
-
-    Attributes:
-        steps: `(N,)` control steps since the episode began.
-        air: `(N,)` whether the feet have left the plate since the last bounce began.
-        gives: `(N,)` control steps for which the character gives way yet.
-        first_s: s, when the first bounce begins.
-    """
-
-    def __init__(self, event: Bounce, sim: SceneSim, control_hz: float):
-        self.first_s = event.first
-        self._event, self._sim, self._hz = event, sim, control_hz
-        self._controls = sim.scene.place(event.plate).controls
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        self._sim, self._hz = sim, control_hz
+        self._controls = sim.scene.place(self.plate).controls
         here = sim.backend.device
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=here)
         self.gives, self.air = torch.zeros_like(self.steps), torch.zeros_like(self.steps)
@@ -393,15 +390,15 @@ class Bouncing(Event):
             value[worlds] = 0
 
     def before_step(self, drive: Drive) -> bool:
-        since = self.steps / self._hz - self._event.first
+        since = self.steps / self._hz - self.first
         up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
         ctrl = self._sim.backend.drive.ctrl
-        ctrl[:, self._controls] = self._event.height * up.to(ctrl).unsqueeze(1)
+        ctrl[:, self._controls] = self.height * up.to(ctrl).unsqueeze(1)
         return False
 
     def after_step(self) -> None:
         self.steps += 1
-        force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self._event.touches)
+        force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self.touches)
         stands = torch.as_tensor(force) > CONTACT_N
         down = stands & (self.air > 0)
         self.gives = torch.where(down, round(GIVES_S * self._hz), (self.gives - 1).clamp_min(0))
