@@ -43,7 +43,7 @@ from poise.formats.point_fit import fit_clip
 from poise.formats.point_noise import fill
 from poise.jobs.track import track
 from poise.kinematics import examine, heal
-from poise.kinematics.repair.doctor import READ_ONLY
+from poise.kinematics.repair.motion_doctor import READ_ONLY
 from poise.motion import Clip, trim
 from poise.motion.clip import resample
 from poise.motion.keypoints import Keypoints

@@ -16,8 +16,8 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.kinematics import examine, heal
-from poise.kinematics.repair.doctor import READ_ONLY
 from poise.kinematics.repair.faults import read_faults
+from poise.kinematics.repair.motion_doctor import READ_ONLY
 from poise.motion import Clip
 
 FILES = (

@@ -16,9 +16,12 @@
 | track_files, track_depth | modules that `poise track` imports, and the longest chain of them |
 | goal_methods, plugin_methods | public methods of the classes `Goal` and `Plugin` of `env` |
 | repeated_* | names of files and of classes that stand in more than one place |
+| verb_file_names | names that only a verb's command line and its job share: `{cli,jobs}/push.py` |
 | unused_* | public ones whose name stands nowhere but in their definition and in `__init__` files |
 
-Names are compared as words: what shares its name with something used counts as used.
+A verb's command line is a file of `cli` that has a function `run`; its pair with a job is a convention,
+and `repeated_file_names` leaves it out. Names are compared as words: what shares its name with something
+used counts as used.
 """
 
 from __future__ import annotations
@@ -243,6 +246,24 @@ def imports(
     return top, everywhere
 
 
+def repeated_files(
+    source: Path, trees: dict[Path, ast.Module]
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Names that several files have, with these files; and those that a verb and its job alone share."""
+    found: dict[str, list[str]] = {}
+    for p in trees:
+        if p.name != "__init__.py":
+            found.setdefault(p.stem, []).append(str(p.relative_to(source)))
+    verbs = {
+        p.stem
+        for p, tree in trees.items()
+        if p.parent == source / "cli" and "run" in {getattr(n, "name", "") for n in tree.body}
+    }
+    repeated = {name: files for name, files in found.items() if len(files) > 1}
+    pairs = [k for k in repeated if k in verbs and repeated[k] == [f"cli/{k}.py", f"jobs/{k}.py"]]
+    return {k: v for k, v in repeated.items() if k not in pairs}, pairs
+
+
 def structure(source: Path) -> dict[str, Any]:
     """All counts of the package in a folder."""
     paths = sorted(source.rglob("*.py"))
@@ -256,7 +277,7 @@ def structure(source: Path) -> dict[str, Any]:
     unused: dict[str, list[str]] = {"functions": [], "classes": [], "methods": []}
     named: Counter[str] = Counter()
     hooks: Counter[str] = Counter()
-    repeated: Counter[str] = Counter(p.stem for p in paths if p.name != "__init__.py")
+    repeated, verbs = repeated_files(source, trees)
     folk: Counter[str] = Counter()
     by_folder: Counter[str] = Counter()
     for p in paths:
@@ -331,7 +352,9 @@ def structure(source: Path) -> dict[str, Any]:
         "plugin_methods": hooks["Plugin"],
         "numeric_constants": counts["numeric_constants"],
         "options_classes": counts["options_classes"],
-        "repeated_file_names": sum(n > 1 for n in repeated.values()),
+        "repeated_file_names": len(repeated),
+        "repeated_files": repeated,
+        "verb_file_names": verbs,
         "repeated_class_names": sum(n > 1 for k, n in named.items() if k[0] != "_" and k != "Options"),
         "who_whose": folk["who"] + folk["whose"],
         "persons": dict(sorted(folk.items())),

@@ -21,9 +21,9 @@ MARKS = {
         "integrations/test_blender.py",
         "learn/test_lock.py::test_a_training_that_was_killed",
         "learn/test_parallel.py",
-        "learn/test_train.py::test_kills",
+        "learn/test_trainer.py::test_kills",
         "live/test_record.py::test_kill_9",
-        "live/test_ahead.py::test_the_loop_goes_on",
+        "live/test_lookahead_process.py::test_the_loop_goes_on",
         "test_face.py::test_importing",
     ),
     "browser": (

@@ -18,12 +18,12 @@ import torch
 import poise
 from poise.control import Compliance, LinearHelp, PDTargets
 from poise.env import TaskConfig
-from poise.env.generator import Steering
+from poise.env.generator_goal import Steering
 from poise.env.pushes import Push, Pushes
 from poise.env.recovery.clock import Recovery
-from poise.env.scene import Throw
+from poise.env.scene_events import Throw
 from poise.errors import PoiseError
-from poise.jobs.inbetween.inbetween_training import Inbetween
+from poise.jobs.inbetween.inbetween_settings import Inbetween
 from poise.jobs.track.direction import Weight
 from poise.learn import PPOConfig, Until
 from poise.motion.noise import Drift

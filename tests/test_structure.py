@@ -25,6 +25,15 @@ def test_no_module_imports_itself_over_others() -> None:
     assert [structure.cycles(graph) for graph in structure.imports(source, trees)] == [[], []]
 
 
+def test_a_file_shares_its_name_with_no_other() -> None:
+    """But a verb's command line with its job: `cli/push.py` and `jobs/push.py`."""
+    source = Path(package).parent
+    trees = {p: ast.parse(p.read_text("utf-8")) for p in sorted(source.rglob("*.py"))}
+    repeated, verbs = structure.repeated_files(source, trees)
+    assert repeated == {}
+    assert "push" in verbs
+
+
 def test_public_modules_are_checked_strictly() -> None:
     """What users import, by the documents and by `import poise`, is in the list of strict modules."""
     imports = re.compile(r"^ *(from poise[.\w]* import (?:\([^)]*\)|.*))$", re.MULTILINE)

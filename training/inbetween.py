@@ -19,7 +19,8 @@ from pathlib import Path
 
 import torch
 
-from poise.jobs.inbetween.inbetween_training import Inbetween, begin, train
+from poise.jobs.inbetween.inbetween_settings import Inbetween
+from poise.jobs.inbetween.inbetween_training import begin, train
 from poise.jobs.library.clips import LibraryConfig
 from poise.learn.between import BetweenConfig, BetweenTraining
 from poise.learn.inbetween_model import BlockStats, load_model, save_model

@@ -25,7 +25,7 @@ from benchmarks.common.runner import Part, Raws
 from benchmarks.common.starts import Nothing
 from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
-from poise.env.generator import GeneratorGoal, Steering
+from poise.env.generator_goal import GeneratorGoal, Steering
 from poise.env.recovery.recovering import FALLS, TRACKS, Recovering
 from poise.jobs.endless.dreaming import dream
 from poise.jobs.endless.dreamt import PIECE, Figures

@@ -39,12 +39,13 @@ from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate, help_left, train, trained_policy
 from poise.jobs.track import imitation_of, side_by_side
 from poise.jobs.track.placement import place
-from poise.jobs.track.supports import crowd as in_one_world
+from poise.jobs.track.surroundings import crowd as in_one_world
 from poise.jobs.warm_start import some_starts
 from poise.learn import Policy, PolicyBundle, Trainer, Until, VecEnv
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.residual_force import build
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.score import run_episodes, score_rollouts
 from poise.sim import CpuBackend, SimConfig
 from poise.sim.backend import STANDARD_FIELDS

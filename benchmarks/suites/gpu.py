@@ -31,7 +31,8 @@ from poise.learn import Trainer, VecEnv, load_checkpoint
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build as build_tracking
-from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.residual_force import build
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.sim import WarpBackend
 from poise.sim.warp_setup import load_warp
 from training.tracker import config as tracker_config

@@ -36,7 +36,8 @@ from poise.jobs.track.placement import place
 from poise.learn import IterationStats, PPOConfig, Until
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, task
+from poise.recipes.residual_force import task
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.score import RolloutSet
 
 #: Of the paper's clips, what its authors' released policies reach: R from random start frames on a

@@ -30,8 +30,8 @@ from poise.formats import read_clip, write_clip
 from poise.formats.own import unpack_clips
 from poise.jobs.complete import complete
 from poise.jobs.inbetween.fill import inbetween, shipped_model
-from poise.jobs.inbetween.inbetween_settings import small
-from poise.jobs.inbetween.inbetween_training import Inbetween, Task, begin, train
+from poise.jobs.inbetween.inbetween_settings import Inbetween, small
+from poise.jobs.inbetween.inbetween_training import Task, begin, train
 from poise.jobs.open import open_run
 from poise.kinematics import retarget
 from poise.learn.inbetween_model import MODEL, Adaptation, InbetweenModel, adapt, load_model
@@ -42,7 +42,7 @@ from poise.motion.rotations import forward_kinematics, normalize
 from poise.motion.windows import FrameBank
 from poise.score.gaps import BANDAI, BANDAI_TAKES, GapRow, TestSet, evaluate, predict, score, test_set
 from poise.synthesis.filler import Gap, interpolated
-from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.keyframes import fill_keyframes
 from training.inbetween import config_of
 
 LENGTHS = (5, 15, 30, 45)

@@ -32,7 +32,7 @@ from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import imitation_of, look_ahead
 from poise.jobs.track.placement import place
-from poise.jobs.track.recovering import look_for, replay
+from poise.jobs.track.recovery_run import look_for, replay
 from poise.jobs.tracker import Tracker
 from poise.metrics import foot_contacts, foot_points
 from poise.motion import Clip

@@ -192,7 +192,7 @@ class NextFrameObjective:
 
 
 class NextFrames:
-    """Makes the next segment of motion frame by frame (`env.generator.MotionGenerator`).
+    """Makes the next segment of motion frame by frame (`env.generator_goal.MotionGenerator`).
 
     Args:
         net: the trained network.

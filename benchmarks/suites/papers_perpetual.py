@@ -31,7 +31,7 @@ from poise.motion import ClipLibrary
 from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build
-from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force_settings import ResidualForce
 
 SAMPLES, SEEDS = 2_000_000, (0, 1)
 #: The library: walks, runs and jumps of five subjects.

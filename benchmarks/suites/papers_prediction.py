@@ -35,7 +35,7 @@ from benchmarks.suites.papers_next_frames import (
 from poise.body import BodyConfig, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, EnvStep, ImitationEnv, Reference
-from poise.env.generator import MotionGenerator
+from poise.env.generator_goal import MotionGenerator
 from poise.jobs.endless.endless_training import codes_of, reach_of
 from poise.jobs.endless.model import Motions, spread
 from poise.jobs.library.clips import LibraryConfig
@@ -53,7 +53,8 @@ from poise.learn.inbetween_model import InbetweenTrainer
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task as universal_task
-from poise.recipes.residual_force import ResidualForce, task
+from poise.recipes.residual_force import task
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.score import Nothing
 from poise.synthesis.generator import ROOT, Kinematic, features_of
 

@@ -27,7 +27,8 @@ from poise.jobs.runs import begin, evaluate, train
 from poise.learn import LATEST, Until, load_policy
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.residual_force import build
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.score import start_frames
 from poise.score.episodes import frames_from
 

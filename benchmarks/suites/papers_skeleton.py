@@ -42,7 +42,7 @@ from poise.motion.windows import pack_frames
 from poise.papers.compliant.scene_training import digest_of
 from poise.papers.skeleton2humanoid.recipe import Budget, build, settings
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.score.gaps import BANDAI, deviation
 
 PAST, AFTER, FPS = 10, 5, 30.0

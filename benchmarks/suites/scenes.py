@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
-from benchmarks.common.clips import WALK, Places
+from benchmarks.common.clips import WALK, Places, moment
 from benchmarks.common.rows import Figure, of, short
 from benchmarks.common.runner import Part, Raws
 from poise.control import Compliance, Stiffness
@@ -27,9 +27,10 @@ from poise.env.pushes import Pushes
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
+from poise.motion import Clip
 from poise.papers.compliant.figures import measure, slope, throws
-from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
-from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.motions import motion_of, standing
+from poise.papers.compliant.scene_play import COUNTS, Played, play
 from poise.papers.compliant.scene_training import shipped
 from poise.papers.compliant.scenes import (
     Balance,
@@ -41,7 +42,6 @@ from poise.papers.compliant.scenes import (
     TrampolineScene,
 )
 from poise.papers.compliant.watch import PUSHED_S
-from poise.sim import SimConfig
 
 COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
 
@@ -92,12 +92,6 @@ def cost(tracker: Tracker, many: int, steps: int, repeats: int) -> dict[str, Any
         k: [round(float(np.quantile(v, q)), 3) for q in (0.25, 0.75)] for k, v in shares.items()
     }
     return out
-
-
-def at_rate(tracker: Tracker, rate_hz: float) -> Tracker:
-    """The same policy with other physics steps."""
-    sim = SimConfig(rate_hz=rate_hz, control_hz=tracker.config.sim.control_hz)
-    return replace(tracker, config=replace(tracker.config, sim=sim))
 
 
 Given = Compliance | Stiffness | None
@@ -222,7 +216,6 @@ def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 Case = tuple[PlayScene, tuple[str, ...], float, int]
 CHICKEN = {
     "chicken, heavy and light": (Chicken(against="rival"), ("level 0.16", LAG)),
-    "chicken, heavy and light, 600 Hz": (Chicken(against="rival"), ("level 0.16",)),
     "chicken, 60 kg each": (Chicken(60.0, 60.0, against="rival"), ("level 0.16",)),
     "chicken, heavy against a bag of 36 kg": (Chicken(85.0, 36.0), ("level 0.16",)),
     "chicken, light against a bag of 85 kg": (Chicken(36.0, 85.0), ("level 0.16",)),
@@ -241,24 +234,31 @@ DOORS = {
     else DoorScene(1.0)
     for w, m in ((1.0, None), (1.35, None), (1.7, None), (1.35, 1.0), (1.7, 1.0))
 }
+RUN = "other/bandai_bvh/dataset-1_run_normal_001.bvh"
 #: Scenes, what gives way beside the twin that does not, s, episodes.
 SCENES: dict[str, Case] = {
     "hand in hand, walking": (
         HandInHand(),
         ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
         8.0,
-        16,
+        32,
+    ),
+    "hand in hand, running": (
+        HandInHand(),
+        ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
+        8.0,
+        32,
     ),
     "hand in hand, standing": (
         HandInHand(),
         ("level 0.16", "level 0.2", LAG, "stiffness 200, lag 0.5 s"),
         8.0,
-        16,
+        32,
     ),
-    **{k: (s, ("level 0.16", LAG, "stiffness 200, lag 0.5 s"), 0.0, 8) for k, s in DOORS.items()},
-    "trampoline": (TrampolineScene(), ("level 0.16", "level 0.04"), 8.0, 8),
-    **{k: (Balance(**v), ("linear law", "learned"), 20.0, 8) for k, v in BALL.items()},
-    **{k: (s, ways, 8.0, 8) for k, (s, ways) in CHICKEN.items()},
+    **{k: (s, ("level 0.16", LAG, "stiffness 200, lag 0.5 s"), 0.0, 32) for k, s in DOORS.items()},
+    "trampoline": (TrampolineScene(), ("level 0.16", "level 0.04"), 8.0, 32),
+    **{k: (Balance(**v), ("linear law", "learned"), 20.0, 32) for k, v in BALL.items()},
+    **{k: (s, ways, 8.0, 32) for k, (s, ways) in CHICKEN.items()},
 }
 
 
@@ -272,43 +272,71 @@ def played(places: Places, unit: str) -> Any:
     scene, ways, seconds, many = SCENES[unit]
     if places.smoke:
         ways, seconds, many = ways[:1], 1.0, 1
-    tracker = at_rate(policy(), 600.0) if "600 Hz" in unit else policy()
+    tracker = policy()
     clip = read_clip(WALK) if unit.endswith("walking") else None
+    if unit.endswith("running"):
+        clip = moment() if places.smoke else read_clip(places.data / RUN)
     out: dict[str, Any] = {"episodes": many}
     for way in ways:
         own = shipped("ball", tracker) if way == "learned" else None
         how = {} if not seconds else {"seconds": seconds}
         made = play(scene, tracker, clip, WAY.get(way), many, threads=1, learned=own, **how)
-        out["without"], out[way] = dict(made.stiff), dict(made.figures)
-    if isinstance(scene, Chicken):
-        touch = next((i for i, arrows in enumerate(made.arrows) if len(arrows)), 0)
-        at = touch / made.evaluation.rollouts.fps
-        out["nobody touches"] = nobody(tracker, scene, at, many, seconds)
+        out["without"], out[way] = told(made.stiff_episodes), told(made.episodes)
+    if not isinstance(scene, Balance):
+        out["nobody touches"] = nobody(tracker, scene, clip, made, many, seconds)
     return out
+
+
+def told(episodes: Mapping[str, np.ndarray]) -> dict[str, list[float | None]]:
+    """Figures of episodes, None where one has none."""
+    return {k: [None if math.isnan(x) else float(x) for x in v] for k, v in episodes.items()}
 
 
 def scene_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Each way's figures."""
     for unit, raw in raws.items():
-        for way, values in raw.items():
-            if way != "episodes":
-                yield from of(f"{unit}, {way}", values, raw["episodes"])
+        for way, figures in raw.items():
+            if way == "episodes":
+                continue
+            for name, every in figures.items():
+                known = [x for x in every if x is not None]
+                if not known:
+                    continue
+                value = sum(known) if name in COUNTS else statistics.fmean(known)
+                yield Figure(f"{unit}, {way}", name, value, len(known), interval(known, name))
+            peaks = figures.get("force_peak_n")
+            if peaks:
+                yield Figure(f"{unit}, {way}", "force_most_n", max(peaks), len(peaks))
+
+
+def interval(values: list[float], name: str) -> str:
+    """The interval of 95 % of a mean, or of a count, as text."""
+    if len(values) < 2:
+        return ""
+    mean = statistics.fmean(values)
+    error = 1.96 * statistics.stdev(values) / math.sqrt(len(values))
+    times = len(values) if name in COUNTS else 1
+    return f"{short(times * (mean - error))} to {short(times * (mean + error))}"
 
 
 def nobody(
-    tracker: Tracker, scene: Chicken, touch_s: float, many: int, seconds: float
-) -> dict[str, float]:
-    """How far the pelvis leaves its way in the same half second where nobody touches the player."""
-    clip = hopping(tracker, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
-    alone = play(Throws(every_s=(100.0, 100.0)), tracker, clip, None, many, seconds, 1)
-    rolled = alone.evaluation.rollouts
-    off = (rolled.pos - rolled.ref_pos)[:, :, 0, :2]
-    first = min(round(touch_s * rolled.fps), off.shape[1] - 2)
-    last = min(first + round(PUSHED_S * rolled.fps), off.shape[1] - 1)
-    return {
-        "pushed_mm": 1000.0 * float((off[:, last] - off[:, first]).norm(dim=-1).mean()),
-        "lost": alone.stiff["lost"],
-    }
+    tracker: Tracker, scene: PlayScene, clip: Clip | None, made: Played, many: int, seconds: float
+) -> dict[str, list[float | None]]:
+    """The same motion from the same starts on a floor where nobody comes: steps, losses, distance,
+    torque. Of a fight also how far the pelvis leaves its way in the half second of the first touch."""
+    own = motion_of(scene, tracker, seconds) or clip
+    free = Throws(every_s=(100.0, 100.0))
+    alone = play(free, tracker, own, None, many, seconds or own.seconds if own else seconds, 1)
+    every = told(alone.stiff_episodes)
+    out = {k: every[k] for k in ("steps", "lost", "off_m", "torque_nm")}
+    if isinstance(scene, Chicken):
+        rolled = alone.evaluation.rollouts
+        touch = next((i for i, arrows in enumerate(made.arrows) if len(arrows)), 0)
+        off = (rolled.pos - rolled.ref_pos)[:, :, 0, :2]
+        first = min(touch, off.shape[1] - 2)
+        last = min(first + round(PUSHED_S * rolled.fps), off.shape[1] - 1)
+        out["pushed_mm"] = (1000.0 * (off[:, last] - off[:, first]).norm(dim=-1)).tolist()
+    return out
 
 
 # --- cost -----------------------------------------------------------------------------------------
@@ -349,7 +377,7 @@ PARTS = {
             scene_rows,
             kinds,
             hours=hours,
-            needs=(),
+            needs=("data",) if name == "hands" else (),
         )
         for name, begins, kinds, hours in (
             ("hands", "hand in hand", _SHIPS, 0.3),

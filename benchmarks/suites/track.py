@@ -23,8 +23,8 @@ from poise.errors import PoiseError
 from poise.formats.raw import ReadOptions
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, track
-from poise.jobs.track.noise import robustness
 from poise.jobs.track.placement import place, points_of
+from poise.jobs.track.robustness import robustness
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip, shifted
 from poise.motion.noise import robustness_levels

@@ -10,7 +10,8 @@ import torch
 from benchmarks.common.stance import relaxed_stance
 from poise.body import BodyConfig, make_humanoid, read_mjcf
 from poise.kinematics import Kinematics, fit_humanoid
-from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.residual_force import build
+from poise.recipes.residual_force_settings import ResidualForce
 from refusals import refused
 from rigs import rig
 

@@ -122,6 +122,32 @@ def test_bad_options(argv: tuple[str, ...], word: str, clip: Path, tmp_path: Pat
     refused("imitate", clip, "-o", tmp_path / "a" / "out", *argv, words=(word,))
 
 
+@pytest.mark.parametrize(
+    ("argv", "sentence"),
+    [
+        (("push", "--force", "0"), "--force must be above 0 and at most 10000 N, got 0.0"),
+        (("push", "--from", "-1"), "--from must be at least 0 s, got -1.0"),
+        (("push", "--seconds=0"), "--seconds must be above 0 s, got 0.0"),
+        (("push", "--stiffness", "nan"), "--stiffness must be above 0 N/m, got nan"),
+        (("push", "--level", "2"), "--level must lie in 0 to 1, got 2.0"),
+        (("body", "--mass", "1"), "--mass must lie in 2 to 5000 kg, got 1.0"),
+        (("body", "--smooth", "-1"), "--smooth must be "),
+        (("track", "--seed", "-1"), "--seed must be a whole number from 0 to 2**63 - 1, got -1"),
+        (("complete", "--keyframes", "0,9", "--threads", "-1"), "--threads must be at least 0, got -1"),
+        (("imitate", "--mass", "nan"), "--mass must lie in 2 to 5000 kg, got nan"),
+        (("imitate", "--set", "body.mass_kg=1"), "mass_kg must lie in 2 to 5000 kg, got 1"),
+    ],
+)
+def test_an_option_is_named_as_it_is_written(
+    argv: tuple[str, ...], sentence: str, clip: Path, tmp_path: Path, refused
+) -> None:
+    """And not as the setting that it states; a setting that --set states keeps its own name."""
+    verb, *options = argv
+    out = tmp_path / ("out.xml" if verb == "body" else "out")
+    error = refused(verb, clip, *options, "-o", out, words=(sentence,))
+    assert f"error: {sentence}" in error or not sentence.startswith("--")
+
+
 def test_incomplete_command_lines(clip: Path, tmp_path: Path, refused) -> None:
     refused("imitate", clip, words=("poise imitate needs -o DIR",))
     refused("imitate", words=("CLIP",))

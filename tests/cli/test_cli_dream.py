@@ -26,6 +26,11 @@ def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert said["result"]["outcome"] == "dreamt" and said["result"]["falls"] == []
     assert read_clip(out).frames == 15
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"score.json", "report.html"}
+    ring = [*argv[:2], "2", *argv[3:-1], str(tmp_path / "ring"), "--loop", "1.2", "--json"]
+    assert main(ring) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert 1.08 < read_clip(said["outputs"]["loop"]).seconds < 1.4
+    assert any("The loop lasts" in note for note in said["notes"])
     assert main(argv) == 2
     assert "--force" in capsys.readouterr().err
 
@@ -39,6 +44,7 @@ def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (["--temperature", "-1"], "temperature must lie in 0 to 10"),
         (["--generator", "none"], "could not be read"),
         (["--past", "none"], "--past"),
+        (["--loop", "50"], "Give --seconds 200"),
     ],
 )
 def test_mistakes_are_one_sentence(

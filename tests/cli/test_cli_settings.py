@@ -15,10 +15,10 @@ from poise import settings
 from poise.cli import imitate, train
 from poise.cli.main import main
 from poise.cli.parse import parse
-from poise.cli.settings import SOURCES, configured, dotted, stated
+from poise.cli.recipe_options import SOURCES, configured, dotted, stated
 from poise.formats import read_clip
 from poise.jobs.endless.endless_training import Endless
-from poise.jobs.inbetween.inbetween_training import Inbetween
+from poise.jobs.inbetween.inbetween_settings import Inbetween
 from poise.jobs.presets import preset_of
 from poise.papers.compliant.scene_training import Compliant
 from poise.papers.perpetual.ablations import StagedPerpetual

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.generator import GeneratorGoal, Steering
+from poise.env.generator_goal import GeneratorGoal, Steering
 from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place

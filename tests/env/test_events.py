@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from poise.env.events import Event
-from poise.env.pushes import Pushes, Pushing
+from poise.env.pushes import Pushes
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
@@ -73,7 +73,7 @@ def test_a_push_is_a_change_of_momentum(task: Imitation) -> None:
     lasts = 3 / 30
     pushes = Pushes(newtons=(60.0, 60.0), every_s=(0.1, 0.1), lasts_s=lasts, bodies=(0, 2), seed=3)
     env = pushed(task, pushes).env(4, 1, False, threads=1, help_scale=0.0)
-    event = env.event(Pushing)
+    event = env.event(Pushes)
     assert event is not None
     zero = torch.zeros(4, dtype=torch.long)
     env.reset_to(zero, zero)
@@ -106,7 +106,7 @@ def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
         assert torch.equal(env.step(actions).obs, other.step(actions).obs)
     one = env.snapshot(torch.tensor([1]))
     other.restore(one)
-    event = other.event(Pushing)
+    event = other.event(Pushes)
     assert event is not None and len(event.left.unique()) == 1
     env.close()
     other.close()
@@ -115,7 +115,7 @@ def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
 def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> None:
     given = Pushes((100.0, 100.0), (0.1, 0.1), (0.1, 2.0), impulse_ns=20.0, share=0.5, seed=4)
     env = pushed(task, given).env(400, 1, False, threads=1)
-    event = env.event(Pushing)
+    event = env.event(Pushes)
     assert event is not None
     env.reset()
     lasts, size = event.lasts / 30, event.force.norm(dim=-1)

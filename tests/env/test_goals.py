@@ -12,9 +12,9 @@ from torch import Tensor
 from poise.env import ImitationEnv
 from poise.env import evaluate as recording
 from poise.env.events import Event, StepOutcome
-from poise.env.generator import GeneratorGoal
+from poise.env.generator_goal import GeneratorGoal
 from poise.env.goal import FADE_S, Goal, extrapolated
-from poise.env.stream import StreamGoal
+from poise.env.stream_goal import StreamGoal
 from poise.env.yielding import DisplacedGoal
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, ObsTerm
 from poise.env.frame import Frame
-from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, near
+from poise.env.scene_events import InScene, Move, ScenePart, SetDown, Switch, Throw, near
 from poise.motion import ClipLibrary
 from poise.papers.compliant.opponents import Teams
 from poise.recipes import ResidualForce, build

@@ -14,7 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from poise.env import ImitationEnv, Reference
 from poise.learn import PPOConfig
-from poise.learn.train import Trainer
+from poise.learn.trainer import Trainer
 from poise.score import run_episodes
 from poise.sim import Drive, NanGuard, WarpBackend
 from toy_human import swing

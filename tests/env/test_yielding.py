@@ -12,7 +12,7 @@ import torch
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
 from poise.env.pushes import Pushes
-from poise.env.scene import InScene, SetDown, touches_of
+from poise.env.scene_events import InScene, SetDown, touches_of
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.learn import PPOConfig
 from poise.motion import ClipLibrary

@@ -14,7 +14,7 @@ from poise.formats import read_clip
 from poise.formats.nodes import unique_names
 from poise.formats.text import MAX_JOINTS
 from poise.motion import find_roles
-from poise.motion.info import describe
+from poise.motion.clip_info import describe
 from refusals import refused
 
 

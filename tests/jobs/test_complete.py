@@ -25,7 +25,7 @@ from poise.kinematics import without_noise
 from poise.kinematics.directed import Pin, TouchPoint, directed, pinned
 from poise.motion import Clip
 from poise.plan import LookaheadConfig
-from poise.synthesis.inbetween import Retiming, retimed
+from poise.synthesis.keyframes import Retiming, retimed
 from refusals import refused
 from toy_human import swing, trembling
 from toy_policy import walk

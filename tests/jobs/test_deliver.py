@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from poise.formats import read_clip
-from poise.jobs.deliver import finished, floor_of, lost_at, simulated_clip
+from poise.jobs.deliver import Evaluation, finished, floor_of, lost_at, simulated_clip
 from poise.jobs.result import Result
-from poise.jobs.runs import Evaluation, evaluate
+from poise.jobs.runs import evaluate
 from poise.kinematics import examine, sole_slide
 from poise.motion import Clip, ClipLibrary, ground_shift
 from poise.recipes import ResidualForce, build

@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from poise.env.recovery.clips import CALM, QUICK
+from poise.env.recovery.get_up import CALM, QUICK
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.perpetual.stages import Progress, Stage, demonstrations, odds, practised, staged
-from poise.jobs.track import TrackConfig, recovering, track
+from poise.jobs.track import TrackConfig, track
+from poise.jobs.track import recovery_run as recovering
 from poise.jobs.track.learning import learn
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy

@@ -21,7 +21,7 @@ from poise.jobs.result import Result
 from poise.jobs.runs import train
 from poise.learn import Until
 from poise.motion import Clip, trim
-from poise.synthesis.inbetween import FilledClips
+from poise.synthesis.keyframes import FilledClips
 from refusals import refused
 
 OLD = Path(__file__).resolve().parents[1] / "fixtures/old"

@@ -10,10 +10,9 @@ import pytest
 
 from poise.cli.main import main
 from poise.formats import read_clip, write_bvh
-from poise.jobs.inbetween.inbetween_settings import small
+from poise.jobs.inbetween.inbetween_settings import Inbetween, small
 from poise.jobs.inbetween.inbetween_training import (
     FRAMES,
-    Inbetween,
     begin,
     library_bank,
     motion_files,

@@ -24,7 +24,7 @@ from poise.jobs.perpetual.evaluation import evaluate_clips, try_recovery
 from poise.jobs.runs import evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.recovering import look_for, replay
+from poise.jobs.track.recovery_run import look_for, replay
 from poise.jobs.tracker import Tracker
 from poise.learn import Until, load_checkpoint
 from poise.motion import trim

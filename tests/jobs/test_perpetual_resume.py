@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
+from poise.jobs.library.files import same_library
 from poise.jobs.perpetual.perpetual_run import begin, resume, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.perpetual.stages import Progress, Stage
@@ -177,6 +179,40 @@ def test_another_run_in_the_folder_is_refused(tmp_path: Path) -> None:
     with refused("library-differs", says="here"):
         resume(tmp_path, CONFIG, "there")
     assert resume(tmp_path, CONFIG, "here").config == CONFIG
+
+
+def test_a_run_goes_on_with_a_folder_that_was_moved(tmp_path: Path) -> None:
+    """Under another name, too; not with a copy of one that is there, nor with one of other clips."""
+    old, new, run = tmp_path / "moves", tmp_path / "disk-2/walks", tmp_path / "run"
+    clips = [c.replaced(name=f"moves-{c.name}") for c in library().clips]
+    for folder in (old, new):
+        folder.mkdir(parents=True)
+        for clip in library().clips:
+            (folder / f"{clip.name}.bvh").write_text("HIERARCHY")
+    begin(run, ClipLibrary.of(clips), CONFIG, f"{old}, without x, onto {old}/a.bvh")
+    moved = f"{new}, without x, onto {new}/a.bvh"
+    with refused("library-differs", says="moves"):
+        resume(run, CONFIG, moved)
+    shutil.rmtree(old)
+    assert resume(run, CONFIG, moved).config == CONFIG
+    for other in (f"{new}, onto {new}/a.bvh", f"{new}, without x, onto {new}/b.bvh"):
+        with refused("library-differs", says="moves"):
+            resume(run, CONFIG, other)
+    (new / "walk.bvh").unlink()
+    with refused("library-differs", says="moves"):
+        resume(run, CONFIG, moved)
+
+
+def test_images_and_folders_of_a_moved_library(tmp_path: Path) -> None:
+    (tmp_path / "b" / "sub-1").mkdir(parents=True)
+    (tmp_path / "b" / "sub-1" / "a-b.bvh").write_text("HIERARCHY")
+    old, new = str(tmp_path / "a"), str(tmp_path / "b")
+    images = ["a-sub-1-a_b", "a-sub-1-a_b-mirrored", "a-sub-1-a_b-mirrored-backwards"]
+    assert same_library([old], [new], images)
+    assert same_library([old], [old], [])
+    assert not same_library([old], [new], ["a-sub-1-a"])
+    assert not same_library([old], [new, "with mirror images"], images)
+    assert not same_library([old], [str(tmp_path / "c")], images)
 
 
 def test_a_single_clip_is_no_library(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from poise.control import ImplicitResidual
 from poise.env import rewards as reward
-from poise.jobs.inbetween.inbetween_training import Inbetween
+from poise.jobs.inbetween.inbetween_settings import Inbetween
 from poise.jobs.presets import NAMES, preset_of
 from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes import ResidualForce, build

@@ -12,7 +12,7 @@ import torch
 
 import poise
 from poise.control import Stiffness
-from poise.env.pushes import OnePush, Push
+from poise.env.pushes import Push
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, track
@@ -83,7 +83,7 @@ def test_lookahead_knows_of_no_push_to_come(task: Imitation) -> None:
     zero = torch.zeros(1, dtype=torch.long)
     env.reset_to(zero, zero)
     still = torch.zeros(1, env.num_actions)
-    ahead = copies.event(OnePush)
+    ahead = copies.event(Push)
     assert ahead is not None
     felt = []
     for _ in range(10):

@@ -16,7 +16,7 @@ import torch
 from poise.jobs.runs import begin, train
 from poise.learn import PPOConfig, Until, load_checkpoint
 from poise.motion import ClipLibrary
-from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force_settings import ResidualForce
 from toy_human import swing
 
 SCRIPT = """

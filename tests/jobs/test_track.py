@@ -15,8 +15,8 @@ from poise.env import ImitationEnv
 from poise.formats import read_clip
 from poise.formats.point_fit import JOINT_PLACES
 from poise.formats.raw import ReadOptions as Options
+from poise.jobs.deliver import Evaluation
 from poise.jobs.open import open_run
-from poise.jobs.runs import Evaluation
 from poise.jobs.track import ResetOnFail, TrackConfig, imitation_of, look_ahead, track
 from poise.jobs.track.controllers import NO_CRITIC
 from poise.jobs.track.placement import home, place, points_of

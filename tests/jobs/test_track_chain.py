@@ -17,9 +17,10 @@ from poise.env import ImitationEnv, Reference
 from poise.env.recovery.recovering import RETURNS, TRACKS, Recovering
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import recovering, track
+from poise.jobs.track import recovery_run as recovering
+from poise.jobs.track import track
 from poise.jobs.track.placement import home, place, place_all
-from poise.jobs.track.recovering import cut, parts_of
+from poise.jobs.track.recovery_run import cut, parts_of
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip, shifted, trim
 from poise.plan import LookaheadConfig

@@ -12,7 +12,7 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.supports import APART_M, crowd, places
+from poise.jobs.track.surroundings import APART_M, crowd, places
 from poise.jobs.tracker import Tracker
 from poise.plan import LookaheadConfig
 from poise.sim import CpuBackend, alone

@@ -8,7 +8,7 @@ import pytest
 
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, track
-from poise.jobs.track.noise import KINDS, noise_of, robustness
+from poise.jobs.track.robustness import KINDS, noise_of, robustness
 from poise.jobs.tracker import Tracker
 from poise.motion.noise import VIDEO, Drift, FrameLoss, Jitter, Level, robustness_levels
 from refusals import refused

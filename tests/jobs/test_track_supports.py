@@ -12,7 +12,7 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.supports import at_home, on_body
+from poise.jobs.track.surroundings import at_home, on_body
 from poise.jobs.tracker import Tracker
 from poise.kinematics.supports import Support, read_supports
 from refusals import refused

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from poise.kinematics.loops import best_period, overlap_of, repeated
+from poise.kinematics.loops import best_period, cut_loop, overlap_of, repeated
+from poise.kinematics.travel import moved_by
 from poise.metrics import jerk
 from poise.motion import Clip, trim
-from poise.motion.rotations import quat_distance
+from poise.motion.rotations import heading_quat, quat_conj, quat_distance, quat_mul, quat_rotate
+from refusals import refused
 from toy_walker import walker
 
 
@@ -85,3 +87,47 @@ def test_no_period_is_taken_from_where_the_motion_is_lost() -> None:
     root[192:, 2] -= 0.5
     made = best_period(long.replaced(root_pos=root), 60, 1, stop=192)
     np.testing.assert_allclose(made.root_pos, one.root_pos, atol=1e-9)
+
+
+def walked_about(seconds: float = 12.0) -> Clip:
+    """A walker of one second a cycle that turns and changes as it goes, so that no part repeats."""
+    cycles = round(seconds)
+    clip = noisy(repeated(walker(1.0), 1, cycles))
+    t = np.arange(clip.frames) / clip.fps
+    return moved_by(clip, np.stack((0.4 * t, 0.1 * t, 0 * t), 1), 0.2 * t)
+
+
+def test_a_loop_is_cut_where_its_end_meets_its_start() -> None:
+    clip = walked_about()
+    made, apart = cut_loop(clip, 5.3)
+    # Whole cycles alone close, whatever is asked for.
+    assert made.cyclic and (made.frames - 1) / made.fps == pytest.approx(5.0, abs=0.07)
+    assert apart < 0.04
+    # The last frame is the first, turned and gone on.
+    np.testing.assert_allclose(np.abs((made.rot[0] * made.rot[-1]).sum(-1))[1:], 1.0, atol=1e-9)
+    assert made.root_pos[-1, 2] == pytest.approx(made.root_pos[0, 2])
+    onto = quat_mul(
+        heading_quat(torch.tensor(made.rot[-1, 0])),
+        quat_conj(heading_quat(torch.tensor(made.rot[0, 0]))),
+    )
+    # Gone on with, the seam is no rougher than the motion.
+    pos = made.positions()
+    ahead = quat_rotate(onto.expand(8, pos.shape[1], 4), torch.tensor(pos[1:9] - made.root_pos[0]))
+    base = made.root_pos[-1] * [1.0, 1.0, 0.0] + made.root_pos[0] * [0.0, 0.0, 1.0]
+    rough = np.linalg.norm(
+        np.diff(np.concatenate((pos, ahead.numpy() + base)), 3, axis=0), axis=-1
+    ).mean(1)
+    assert rough[made.frames - 4 :].max() < 1.3 * rough[: made.frames - 20].max()
+    # Frames before the join are the motion's own.
+    own = clip.positions()
+    starts = np.linalg.norm(own - pos[0], axis=-1).max(1).argmin()
+    np.testing.assert_allclose(pos[:60], own[starts : starts + 60], atol=1e-9)
+
+
+def test_a_loop_holds_nothing_that_is_excluded() -> None:
+    clip = walked_about()
+    made, _ = cut_loop(clip, 3.0, [(0.0, 4.0), (9.0, 20.0)])
+    start = np.linalg.norm(clip.positions() - made.positions()[0], axis=-1).max(1).argmin()
+    assert start > 4.0 * 30 and start + made.frames - 1 < 9.0 * 30
+    with refused("clip-too-short", says="holds no 6 s in a row"):
+        cut_loop(clip, 6.0, [(0.0, 4.0), (9.0, 20.0)])

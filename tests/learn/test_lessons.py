@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import torch
-from test_train import TOY, assert_same
+from test_trainer import TOY, assert_same
 from torch import Tensor
 from toy_point_env import PointEnv
 

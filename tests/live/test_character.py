@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env.recovery.clips import GetUpPlanner
+from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import walk_of
 from poise.jobs.open import open_run
 from poise.live.characters import (

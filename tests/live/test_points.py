@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from poise.env.stream import StreamGoal
+from poise.env.stream_goal import StreamGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker

@@ -116,7 +116,8 @@ def test_a_plan_holds_every_clip_and_a_cycle_goes_on(make_env: MakeEnv) -> None:
 def test_a_real_walk_is_followed_without_learning(data_dir) -> None:
     from poise.formats import read_clip
     from poise.jobs.warm_start import score_expert
-    from poise.recipes.residual_force import ResidualForce, build
+    from poise.recipes.residual_force import build
+    from poise.recipes.residual_force_settings import ResidualForce
 
     imitation = build(read_clip(data_dir / "cmu_amc/02/02_01.amc"), ResidualForce())
     card = score_expert(imitation)

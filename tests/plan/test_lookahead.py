@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.stream import StreamGoal
+from poise.env.stream_goal import StreamGoal
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place

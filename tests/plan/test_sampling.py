@@ -13,7 +13,7 @@ from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.recovering import look_for, replay
+from poise.jobs.track.recovery_run import look_for, replay
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.plan import SamplingConfig
 from refusals import refused

@@ -9,7 +9,7 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.env.evaluate import seen_by
-from poise.env.stream import StreamGoal
+from poise.env.stream_goal import StreamGoal
 from poise.learn import PPOConfig
 from poise.motion.rotations import axis_angle_to_quat, lateral_heading, quat_mul
 from poise.papers.perpetual.ablations import StagedPerpetual

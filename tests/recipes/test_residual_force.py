@@ -21,7 +21,7 @@ from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import schedule, task
 from poise.recipes.residual_force_settings import config_of, most_help
 from poise.score import Nothing, run_episodes, start_frames
-from poise.sim.mjcf import write_mjcf
+from poise.sim.scene import write_mjcf
 from refusals import refused
 from toy_human import swing, trembling
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pytest
 import torch
 
@@ -25,7 +26,7 @@ from poise.score import (
     simulate,
     start_frames,
 )
-from poise.score.episodes import OFF_RAD
+from poise.score.episodes import OFF_RAD, Spread
 from refusals import refused
 from toy_human import swing
 
@@ -203,6 +204,27 @@ def test_perturbed_starts_are_drawn_world_by_world():
     assert not torch.equal(three[1], three[2])
     # Which worlds are beside it changes nothing.
     assert torch.equal(first([1], [0])[0], three[1])
+
+
+def test_a_spread_moves_what_it_says() -> None:
+    spread = Spread(0.02, 0.05, 0.3, 0.4, heading_rad=0.2)
+    rng = np.random.default_rng(0)
+    qpos = torch.zeros(2000, 10, dtype=torch.float64)
+    qpos[:, 3] = 1.0
+    qvel = torch.zeros(2000, 9, dtype=torch.float64)
+    qvel[:, 0] = 2.0
+    for a, b in zip(qpos, qvel, strict=True):
+        spread.move(a, b, rng)
+    std = [float(x.std()) for x in (qpos[:, 7:], qpos[:, :2], qvel[:, 2], qvel[:, 3:])]
+    assert std == pytest.approx([0.02, 0.05, 0.3, 0.4], rel=0.06)
+    assert torch.equal(qpos[:, 2], torch.zeros(2000).double())
+    # A character that turns goes where it faces.
+    yaw = 2 * torch.atan2(qpos[:, 6], qpos[:, 3])
+    assert float(yaw.std()) == pytest.approx((0.2**2 + 0.02**2) ** 0.5, rel=0.06)
+    assert float((qvel[:, 1] - 2.0 * yaw.sin()).std()) < 0.33
+    still = [qpos[0].clone(), qvel[0].clone()]
+    Spread(0.0, 0.0, 0.0, 0.0).move(*still, rng)
+    assert torch.allclose(still[0], qpos[0]) and torch.equal(still[1], qvel[0])
 
 
 def test_a_run_is_scored_beside_doing_nothing_over_perturbed_starts():

@@ -11,7 +11,7 @@ import pytest
 from poise.body import BodyConfig, Humanoid
 from poise.kinematics import fit_humanoid
 from poise.sim import SimConfig, alone
-from poise.sim.mjcf import mjcf_of, write_mjcf
+from poise.sim.scene import mjcf_of, write_mjcf
 from toy_policy import walk
 
 #: Arrays of a model that say what it is; MJCF holds six digits.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -44,6 +45,28 @@ def standing(humanoid: Humanoid, count: int, x: float = 0.0, z: float = 1.0) -> 
     qpos[:, 0], qpos[:, 2] = x, z
     qpos[:, 7:] += 0.1 * torch.randn(count, model.nu, generator=rng, dtype=torch.float64)
     return qpos, torch.zeros(count, model.nv, dtype=torch.float64)
+
+
+def test_bodies_of_two_characters_meet_softly_and_the_floor_as_ever(humanoid: Humanoid) -> None:
+    """A contact of two characters has an impedance of a half, so that a wedged limb is not torn at."""
+
+    def contacts(*characters: Character) -> dict[bool, set[tuple[float, ...]]]:
+        model = Scene(characters).compile().model
+        data = mujoco.MjData(model)
+        for k in range(len(characters)):
+            data.qpos[k * model.nq // len(characters) + 2] = 0.3
+        mujoco.mj_forward(model, data)
+        found: dict[bool, set[tuple[float, ...]]] = {True: set(), False: set()}
+        for c in data.contact:
+            floor = 0 in model.geom_bodyid[list(c.geom)]
+            found[floor].add((*c.solref.tolist(), *c.solimp.tolist(), *c.friction.tolist(), c.dim))
+        return found
+
+    alone_ = contacts(Character(humanoid))
+    both = contacts(Character(humanoid, "a"), Character(humanoid, "b"))
+    assert both[True] == alone_[True] and len(both[True]) == 1 and not alone_[False]
+    (between,) = both[False]
+    assert between[2:4] == (0.5, 0.5)
 
 
 def free(*rows: tuple[float, ...]) -> tuple[Tensor, Tensor]:

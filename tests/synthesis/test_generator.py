@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env.generator import GeneratorGoal
+from poise.env.generator_goal import GeneratorGoal
 from poise.jobs.endless.endless_training import Endless, balanced, motions_of, train_generator
 from poise.jobs.endless.model import GeneratorModel, Motions, load_generator
 from poise.jobs.open import open_run

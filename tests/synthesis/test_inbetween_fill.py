@@ -15,7 +15,7 @@ from poise.learn.inbetween_model import Adaptation, InbetweenModel, load_model, 
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import quat_conj, quat_distance, quat_mul
 from poise.synthesis.filler import Filling, OtherRig
-from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.keyframes import fill_keyframes
 from refusals import refused
 from toy_human import human, swing
 from toy_windows import SMALL, SMALL_RTN, bank, layout

@@ -16,7 +16,7 @@ from poise.jobs.track.direction import direction_of
 from poise.kinematics.directed import PELVIS, TouchPoint, directed
 from poise.motion import Clip
 from poise.plan import LookaheadConfig
-from poise.synthesis.inbetween import Partial, moved_to, partials_of, timed, times_of
+from poise.synthesis.keyframes import Partial, moved_to, partials_of, timed, times_of
 from refusals import refused
 from toy_human import swing
 from toy_policy import walk

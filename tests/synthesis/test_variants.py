@@ -10,7 +10,7 @@ from poise.learn.between import Between
 from poise.learn.inbetween_model import make_net
 from poise.motion.windows import FrameBank
 from poise.synthesis.filler import ASIDE_M, TURNED, Detour, Filling, drawn, through
-from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.keyframes import fill_keyframes
 from toy_human import swing
 from toy_windows import SMALL, bank, layout
 

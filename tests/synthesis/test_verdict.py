@@ -10,7 +10,7 @@ from test_inbetween_fill import model
 from poise.kinematics.repair.faults import KINDS
 from poise.motion import Clip
 from poise.synthesis.filler import Filler, Filling, Gap
-from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.keyframes import fill_keyframes
 from poise.synthesis.limits import Feet
 from poise.synthesis.rounds import JUDGED, GapFault, distance, judged, told, weight
 from toy_human import swing

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from poise.env.generator import GeneratorGoal
+from poise.env.generator_goal import GeneratorGoal
 from poise.jobs.endless.model import load_generator
 from poise.jobs.open import open_run
 from poise.synthesis.generator import FEWEST, Codes, Wishes

@@ -40,7 +40,7 @@ def run(
         own = () if body.body is None else (body.body,)
         may_write(out, force, clip, *own)
     from poise.kinematics import fit_humanoid
-    from poise.sim.mjcf import write_mjcf
+    from poise.sim.scene import write_mjcf
 
     motion = reading.read(clip)
     humanoid, _, report = fit_humanoid(motion, config)

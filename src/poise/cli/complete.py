@@ -24,7 +24,7 @@ from poise.cli.options import (
     check_range,
     places,
 )
-from poise.cli.settings import TRACK, derived, given, named_options
+from poise.cli.recipe_options import TRACK, derived, given
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -98,10 +98,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.result import story
     from poise.jobs.track_settings import TrackConfig
     from poise.synthesis.filler import check_keyframes
-    from poise.synthesis.inbetween import partials_of, times_of
+    from poise.synthesis.keyframes import partials_of, times_of
 
-    with named_options("TrackConfig"):
-        config = TrackConfig(**given(o.tracking), **o.directing.values())
+    config = TrackConfig(**given(o.tracking), **o.directing.values())
     times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)
     keys = tuple(range(clip.frames)) if every else keys
@@ -161,7 +160,7 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     from poise.formats import check_writable, names_file, write_clip
     from poise.jobs.inbetween.fill import inbetween
     from poise.synthesis.filler import check_keyframes
-    from poise.synthesis.inbetween import timed, times_of
+    from poise.synthesis.keyframes import timed, times_of
 
     path = o.out if names_file(o.out) and not o.out.is_dir() else o.out / f"filled{o.clip.suffix}"
     check_writable(path)

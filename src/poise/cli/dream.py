@@ -22,7 +22,6 @@ from poise.cli.options import (
     lookahead_of,
     places,
 )
-from poise.cli.settings import named_options
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -43,6 +42,7 @@ def run(
     steer: Annotated[str | None, arg(metavar="'X,Y X,Y'|FILE", help_behavior_hint="")] = None,
     style: Annotated[str | None, arg(metavar="LABEL", help_behavior_hint="")] = None,
     label_seconds: Annotated[float, arg(metavar="S")] = 10.0,
+    loop: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None,
     generator: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None,
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None,
     controller: Literal["lookahead", "policy"] = "lookahead",
@@ -71,6 +71,8 @@ def run(
         style: only motion of this label, where the generator's library has labels, such as dance.
         label_seconds: it keeps to motion of one label of the library for about so long, and then turns
             to another one; 0 leaves that to chance. Neither with --style nor on the way to points.
+        loop: write a part of about so many seconds whose end meets its start, too, as loop with the
+            ending of the motion's file; the first character's, without falls.
         generator: a kinematic policy: its file, or the folder of poise train endless; by default the one
             that comes with Poise.
         policy: the control policy; by default the one that comes with Poise.
@@ -85,33 +87,41 @@ def run(
     check_range("threads", threads, 0)
     check_range("seconds", seconds, 0.1, 36_000)
     check_range("label-seconds", label_seconds, 0, 3600)
+    if loop is not None:
+        check_range("loop", loop, 1, 600)
+        if 1.5 * loop > seconds:
+            raise PoiseError(
+                f"a loop of {loop:g} s is looked for in a longer motion, and this has {seconds:g} s",
+                "--loop", f"Give --seconds {max(60.0, 4 * loop):g}", code="clip-too-short",
+            )  # fmt: skip
     folder, motion = places(out)
     read = () if seed_clip is None else (seed_clip,)
     may_deliver(folder, motion, force, *read)
     targets = () if steer is None else targets_of(steer)
+    from poise.formats import write_clip
     from poise.jobs.endless.dreaming import dream, names_of
     from poise.jobs.endless.dreamt import Dream
     from poise.jobs.endless.model import load_generator
     from poise.jobs.open import open_run
 
     ahead = lookahead_of(budget)
-    with named_options("Dream"):
-        config = Dream(
-            temperature=temperature,
-            count=count,
-            targets=targets,
-            seed=seed,
-            controller=controller,
-            lookahead=ahead,
-            recover=recover,
-            past=past,
-            style=style,
-            label_seconds=label_seconds,
-            hold_feet=hold_feet,
-            threads=threads,
-        )
+    config = Dream(
+        temperature=temperature,
+        count=count,
+        targets=targets,
+        seed=seed,
+        controller=controller,
+        lookahead=ahead,
+        recover=recover,
+        past=past,
+        style=style,
+        label_seconds=label_seconds,
+        hold_feet=hold_feet,
+        threads=threads,
+    )
     files = names_of(motion or folder / "simulated.bvh", count)
-    for file in files:
+    ring = files[0].with_name(f"loop{files[0].suffix}")
+    for file in (*files, *(() if loop is None else (ring,))):
         may_write(file, force, *read)
     clip = None if seed_clip is None else reading.read(seed_clip)
     with working("opening the policies"):
@@ -125,6 +135,16 @@ def run(
             return Answer(exit_code=INTERRUPTED, outcome="interrupted")
         with working("writing"):
             paths = done.write_score(folder)
+            notes = list(done.notes)
+            if loop is not None:
+                try:
+                    clip, said = done.loop(loop)
+                except PoiseError as problem:
+                    notes.append(f"No loop is written: {problem.what}. {problem.hint}.")
+                else:
+                    write_clip(clip, ring)
+                    paths["loop"] = ring
+                    notes.append(said)
     _say(done)
     say(done.sentence)
     if done.interrupted:
@@ -133,7 +153,7 @@ def run(
     word = "interrupted" if done.interrupted else "lost" if done.stayed_down else "dreamt"
     code = INTERRUPTED if done.interrupted else LOST if done.stayed_down else 0
     result = {"outcome": word, **done.to_dict()}
-    return Answer(result, {**named, **paths}, done.notes, code, word)
+    return Answer(result, {**named, **paths}, tuple(notes), code, word)
 
 
 def targets_of(text: str) -> tuple[tuple[float, float], ...]:

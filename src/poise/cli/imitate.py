@@ -23,7 +23,7 @@ from poise.cli.options import (
     places,
     printed,
 )
-from poise.cli.settings import given
+from poise.cli.recipe_options import given
 from poise.cli.track import follow
 from poise.cli.training import Shown, beginning, clock, command_line, left, stopped, summary
 from poise.errors import PoiseError

@@ -38,7 +38,7 @@ def run(
     if any(path.is_dir() for path in clips):
         return each("info", clips, None, lambda p, _: run((p,), json, reading))
     from poise.kinematics import find_faults, find_guesses
-    from poise.motion.info import describe
+    from poise.motion.clip_info import describe
 
     read = [reading.read(path) for path in clips]
     facts, faults = [describe(clip) for clip in read], [find_faults(clip) for clip in read]

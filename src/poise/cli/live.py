@@ -14,7 +14,6 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import Answer, say, tell
 from poise.cli.options import Flag, Json, OpenPage, PolicyFile, Reading, check_range
-from poise.cli.settings import named_options
 from poise.cli.training import working
 from poise.errors import PoiseError
 
@@ -92,8 +91,7 @@ def run(
                 tell(f"{clip.name} {travel.words()}: a character is given that travel.", "yellow")
                 motions[name] = travelled(clip, travel)
         count = characters or max(1, len(motions))
-        with named_options("LiveConfig"):
-            config = LiveConfig(count, buffer, lookahead, noise, seed)
+        config = LiveConfig(count, buffer, lookahead, noise, seed)
         token = None if host in LOOPBACK else secrets.token_urlsafe(24)
         wanted = SessionConfig(
             motions,

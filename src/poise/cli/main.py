@@ -121,12 +121,14 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         )
     from poise.cli.console import notes, say, tell
     from poise.cli.parse import options_of, parse
+    from poise.cli.recipe_options import named_options
 
     name, prog, rest = parser_of(verb, rest)
     module = import_module(f"poise.cli.{name}")
     # A command that prints the settings alone need name no files.
     blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
-    options = parse(options_of(module), rest, prog, blank)
+    known = options_of(module)
+    options = parse(known, rest, prog, blank)
     if blank is None:
         inputs += inputs_of(options)
         # What is imported now takes seconds.
@@ -134,7 +136,8 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     if verb != "open":
         # Its jobs have processes of their own.
         share_cores(verb not in _LIGHT)
-    answer = module.run(**options) if isinstance(options, dict) else module.run(options, rest)
+    with named_options(known, rest):
+        answer = module.run(**options) if isinstance(options, dict) else module.run(options, rest)
     notes([n for n in answer.notes if n not in answer.said])
     for path in answer.outputs.values():
         say(str(path))

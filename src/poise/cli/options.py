@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 from tyro.conf import UseAppendAction, arg
 
 from poise.cli.console import INTERRUPTED, LOST, REFUSED, Answer, document, failure, say, table, tell
-from poise.cli.settings import base_of, configured, derived, stated
+from poise.cli.recipe_options import base_of, configured, derived, stated
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:

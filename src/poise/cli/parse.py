@@ -20,7 +20,7 @@ from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
 
-from poise.cli.settings import capital, dotted, texts_of
+from poise.cli.recipe_options import capital, dotted, texts_of
 from poise.errors import PoiseError, did_you_mean
 
 T = TypeVar("T")

@@ -40,7 +40,9 @@ def run(
     clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
     duration: Annotated[float, arg(metavar="SECONDS")] = 8.0,
     level: Annotated[float | None, arg(metavar="0-1", help_behavior_hint="")] = None,
-    stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None,
+    newtons_per_metre: Annotated[
+        float | None, arg(name="stiffness", metavar="N/M", help_behavior_hint="")
+    ] = None,
     lag: Annotated[float, arg(metavar="SECONDS")] = 0.5,
     count: Annotated[int, arg(metavar="N")] = 16,
     newtons: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None,
@@ -79,9 +81,9 @@ def run(
         clip: what the character does; by default it stands.
         duration: how long it stands.
         level: level of compliance; by default 0.16, or for the ball a stiffness.
-        stiffness: give way as a spring of so many newtons per metre in place of --level.
+        newtons_per_metre: give way as a spring of so many newtons per metre in place of --level.
         lag: how fast it gives way with --stiffness: the time constant. Held hands need a slow one.
-        count: episodes, side by side, that begin a hair apart; the report shows the first.
+        count: episodes, side by side, whose starts differ; the report shows the first.
         newtons: pull: how hard (20).
         direction: pull: where to, Z up (0,1,0).
         side: pull, hands: which hand (left).
@@ -136,11 +138,11 @@ def run(
         "against": against,
         "seed": seed,
     }
-    place, given = scene_of(scene, stated), given_of(level, stiffness, lag)
+    place, given = scene_of(scene, stated), given_of(level, newtons_per_metre, lag)
     motion = None if clip is None else reading.read(clip)
     with working("opening the policy"):
         tracker = open_run(policy).tracker
-        chosen = level is not None or stiffness is not None
+        chosen = level is not None or newtons_per_metre is not None
         if learned is None:
             alone = chosen or controller == "lookahead"
             knows = None if alone else shipped(scene, tracker)
@@ -171,7 +173,7 @@ def run(
             "no browser could be opened", paths["report"], "Open the page by hand", code="no-browser"
         )
     result = {"scene": scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
-    return Answer(result, paths, () if given is None else given.notes)
+    return Answer(result, paths, (*played.notes, *(() if given is None else given.notes)))
 
 
 def given_of(level: float | None, stiffness: float | None, lag: float) -> Compliance | Stiffness | None:

@@ -21,7 +21,6 @@ from poise.cli.options import (
     check_range,
     places,
 )
-from poise.cli.settings import named_options
 from poise.cli.training import working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver
@@ -30,7 +29,7 @@ from poise.jobs.keep import claimed, may_deliver
 def run(
     clip: Annotated[Positional[Path], arg(metavar="CLIP")],
     out: Out,
-    force: Annotated[float, arg(metavar="NEWTONS")] = 150.0,
+    newtons: Annotated[float, arg(name="force", metavar="NEWTONS")] = 150.0,
     at: Annotated[str, arg(metavar="PART")] = "hand",
     start: Annotated[float, arg(name="from", metavar="SECONDS")] = 1.0,
     seconds: Annotated[float, arg(metavar="SECONDS")] = 0.5,
@@ -55,7 +54,7 @@ def run(
 
     Args:
         clip: the motion file.
-        force: how hard it is pushed.
+        newtons: how hard it is pushed.
         at: the part that is pushed: hand, elbow, shoulder, hip, knee or foot, the right one (left_hand
             is the other); head, chest or pelvis; or a body of the policy by its name.
         start: when the push begins.
@@ -75,7 +74,7 @@ def run(
     """
     from poise.jobs.track.pushed import PushConfig
 
-    push = PushConfig(force, at, start, seconds, direction_of(direction), level, stiffness, law)
+    push = PushConfig(newtons, at, start, seconds, direction_of(direction), level, stiffness, law)
     check_range("seed", seed, 0)
     check_range("threads", threads, 0)
     folder, motion = places(out)
@@ -85,16 +84,15 @@ def run(
     from poise.jobs.result import story
     from poise.jobs.track import TrackConfig
 
-    with named_options("TrackConfig"):
-        config = TrackConfig(
-            seed=seed,
-            controller=controller,
-            threads=threads,
-            body=body,
-            push=push,
-            smooth_hz=reading.smooth,
-            in_place=in_place,
-        )
+    config = TrackConfig(
+        seed=seed,
+        controller=controller,
+        threads=threads,
+        body=body,
+        push=push,
+        smooth_hz=reading.smooth,
+        in_place=in_place,
+    )
     source = reading.read(clip)
     with working("opening the policy"):
         tracker = open_run(policy).tracker

@@ -24,7 +24,7 @@ from poise.cli.options import (
     each,
     places,
 )
-from poise.cli.settings import TRACK, derived, given, named_options
+from poise.cli.recipe_options import TRACK, derived, given
 from poise.cli.training import clock, left, showing, staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -102,7 +102,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 def config_of(o: Options) -> TrackConfig:
     """How it is tracked, as the command line states it."""
-    from poise.jobs.track.noise import noise_of
+    from poise.jobs.track.robustness import noise_of
     from poise.jobs.track_settings import TrackConfig
     from poise.plan import SamplingConfig
 
@@ -111,8 +111,7 @@ def config_of(o: Options) -> TrackConfig:
     check_range("characters", o.characters, 8, 65_536)
     check_range("rounds", o.rounds, 1, 20)
     search = SamplingConfig(o.characters, rounds=o.rounds)
-    with named_options("TrackConfig"):
-        config = TrackConfig(search=search, **how, **more)
+    config = TrackConfig(search=search, **how, **more)
     config.check(len(o.clips))
     return config
 

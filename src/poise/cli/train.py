@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.console import Answer, say
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Chosen, Json, Reading, Training, printed
-from poise.cli.settings import SOURCES, given
+from poise.cli.recipe_options import SOURCES, given
 from poise.cli.train_inbetween import Network
 from poise.cli.train_perpetual import BY_HAND, Primitives, goes_on, settings
 from poise.cli.training import Shown, command_line, stopped

@@ -44,7 +44,7 @@ def run(
     refuse_held(out, RUN_FILE, training)
     torch.set_num_threads(training.threads or cores())
     if training.iterations is not None:
-        from poise.cli.settings import configured
+        from poise.cli.recipe_options import configured
 
         config = configured(config, {"steps": training.iterations})
     counted = training.iterations is not None or training.preset == "paper"

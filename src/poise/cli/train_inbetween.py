@@ -10,7 +10,7 @@ from tyro.conf import arg
 
 from poise.cli.console import Answer, say, tell
 from poise.cli.library_options import Library
-from poise.cli.settings import derived
+from poise.cli.recipe_options import derived
 from poise.cli.training import clock, finished, refuse_held, showing
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
@@ -19,7 +19,7 @@ from poise.machine import cores
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.jobs.inbetween.inbetween_training import Inbetween
+    from poise.jobs.inbetween.inbetween_settings import Inbetween
     from poise.learn.inbetween_model import BlockStats
 
 if TYPE_CHECKING:

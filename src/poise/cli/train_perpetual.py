@@ -14,8 +14,8 @@ from tyro.conf import arg
 from poise.cli import training as progress
 from poise.cli.console import Answer, launched, notes, say, table, tell
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Flag, Training
-from poise.cli.settings import SOURCES, configured, derived, given, stated
+from poise.cli.options import Body, Flag, Training, check_range
+from poise.cli.recipe_options import SOURCES, configured, derived, given, stated
 from poise.cli.training import beginning, clock, held_already, left, showing, stopped
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
@@ -181,6 +181,7 @@ def settings(
         raise PoiseError(
             f"--max-primitives must lie in 1 to 64, got {values['max_primitives']}", code="out-of-range"
         )
+    check_range("paths", primitives.paths, 0)
     if primitives.paths and values.get("expert") is False:
         raise PoiseError(
             "--paths are for the expert, and --no-expert does without",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,11 +14,13 @@ from poise.env.evaluate import TensorFunction, record
 from poise.env.events import Event
 from poise.env.frame import hinge_torques
 from poise.env.goal import Goal
-from poise.env.help import HelpBudget
 from poise.env.recovery.clock import RecoveryClock
-from poise.env.task import TaskConfig
 from poise.errors import PoiseError
 from poise.sim import Backend, Drive, NanGuard
+
+if TYPE_CHECKING:
+    from poise.env.help import HelpBudget
+    from poise.env.task import TaskConfig
 
 
 def keep_actions(actions: Tensor, last: Tensor, kept: Tensor, hinges: int) -> None:

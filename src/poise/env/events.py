@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Generic, NamedTuple, Self, TypeVarTuple
 
 import torch
 from torch import Tensor
@@ -158,6 +159,27 @@ class Force(Event):
     def felt(self) -> Felt | None:
         """The forces on the characters; None where there are none."""
         return None
+
+
+#: What an event is told of the worlds that it happens to, such as a goal and a backend.
+Worlds = TypeVarTuple("Worlds")
+
+
+class StatedEvent(Generic[*Worlds]):
+    """Base of events that are dataclasses: their fields are the settings, which stay as they are.
+
+    A task holds such an event as it is stated. Called with worlds it gives a copy that is at work in
+    them, so that one statement serves many environments.
+    """
+
+    def __call__(self, *worlds: *Worlds) -> Self:
+        """The event at work in these worlds."""
+        event = copy(self)
+        event.enter(*worlds)
+        return event
+
+    def enter(self, *worlds: *Worlds) -> None:
+        """Makes everything that the event knows of its worlds."""
 
 
 #: Control steps of all worlds after which failures are counted up, and what is then left of older ones.

@@ -13,12 +13,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from poise.env.env import ImitationEnv
 from poise.env.task import EnvStep
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
+
+    from poise.env.env import ImitationEnv
 
 
 Info = dict[str, Any]

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.frame import PoseLayout
-from poise.env.reference import Reference, Start
 from poise.env.starts import Starts
 from poise.errors import PoiseError
 from poise.sim import displaced
+
+if TYPE_CHECKING:
+    from poise.env.reference import Reference, Start
 
 #: s in which an extrapolated motion comes to rest: its velocity falls by e in each.
 FADE_S = 0.1

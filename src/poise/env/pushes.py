@@ -9,16 +9,19 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from poise.env.events import EpisodeStart, Felt, Force
+from poise.env.events import EpisodeStart, Felt, Force, StatedEvent
 from poise.env.goal import Goal
 from poise.errors import PoiseError
 from poise.settings import Checked, Count, Length, Positive, Range, Share
 from poise.sim import Backend, Drive
 
 
-@dataclass(frozen=True)
-class Push(Checked):
+@dataclass
+class Push(StatedEvent[Goal, Backend], Force, Checked):
     """A constant force on one body for some time of each episode; given to `TaskConfig.events`.
+
+    At work it counts `step` `(N,)`, the control steps of each episode that were made, and keeps `acts`
+    `(N,)` bool, the characters that are pushed in the next one.
 
     Attributes:
         row: of the body table; the force acts at the body's inertial centre.
@@ -36,30 +39,17 @@ class Push(Checked):
     steps: Count
     foreseen: bool = True
 
-    def __call__(self, goal: Goal, backend: Backend) -> OnePush:
-        """The event of an environment."""
+    def enter(self, goal: Goal, backend: Backend) -> None:
         bodies = len(goal.humanoid.bodies)
         if self.row >= bodies:
             raise PoiseError(
                 f"the body has {bodies} parts, there is no row {self.row}", "Push", code="index-outside"
             )
-        return OnePush(self, backend)
-
-
-class OnePush(Force):
-    """The push on the characters of a backend.
-
-    Attributes:
-        step: `(N,)` control steps of each episode that were made.
-        acts: `(N,)` bool, characters that are pushed in the next control step.
-    """
-
-    def __init__(self, push: Push, backend: Backend):
-        self.given, self._backend = push, backend
+        self._backend = backend
         n, here = backend.num_envs, backend.device
         self.step = torch.zeros(n, dtype=torch.long, device=here)
         self.acts = torch.zeros(n, dtype=torch.bool, device=here)
-        self._force = torch.tensor(push.force).to(backend.drive.xfrc_applied)
+        self._newtons = torch.tensor(self.force).to(backend.drive.xfrc_applied)
         self._know()
 
     def begin(self, episodes: EpisodeStart) -> None:
@@ -69,14 +59,14 @@ class OnePush(Force):
 
     def before_step(self, drive: Drive) -> bool:
         """Adds the force."""
-        drive.xfrc_applied[self.acts, self.given.row + 1, :3] += self._force
+        drive.xfrc_applied[self.acts, self.row + 1, :3] += self._newtons
         return False
 
     def felt(self) -> Felt:
         """The push, where it acts."""
-        n, body = len(self.acts), self.given.row + 1
+        n, body = len(self.acts), self.row + 1
         rows = torch.full((n, 1), body, dtype=torch.long, device=self.acts.device)
-        force = self._force * self.acts.unsqueeze(1)
+        force = self._newtons * self.acts.unsqueeze(1)
         return Felt(rows, self._backend.state.xipos[:, body : body + 1], force.unsqueeze(1))
 
     def after_step(self) -> None:
@@ -88,19 +78,22 @@ class OnePush(Force):
         return {"one push/step": self.step, "one push/acts": self.acts}
 
     def _know(self) -> None:
-        if self.given.foreseen:
-            first = self.given.first
-            self.acts.copy_((self.step >= first) & (self.step < first + self.given.steps))
+        if self.foreseen:
+            self.acts.copy_((self.step >= self.first) & (self.step < self.first + self.steps))
 
 
 #: Control steps until a push of an episode that has none.
 NEVER = 10**9
 
 
-@dataclass(frozen=True)
-class Pushes(Checked):
+@dataclass
+class Pushes(StatedEvent[Goal, Backend], Force, Checked):
     """Pushes on random bodies at random times, each of a random horizontal direction; given to
     `TaskConfig.events`.
+
+    At work it has, of N characters, `left` `(N,)`, control steps until a push begins, and from 0 down
+    those that it has lasted; and of the next or present push `lasts` `(N,)` control steps, `force`
+    `(N, 3)` N in world axes, and `body` `(N,)`, MuJoCo's body that it is on.
 
     Attributes:
         newtons: between which the force is drawn, N.
@@ -128,25 +121,10 @@ class Pushes(Checked):
         given = self.lasts_s
         return given if isinstance(given, tuple) else (given, given)
 
-    def __call__(self, goal: Goal, backend: Backend) -> Pushing:
-        """The event of an environment."""
-        return Pushing(self, backend)
-
-
-class Pushing(Force):
-    """The pushes on the characters of a backend.
-
-    Attributes:
-        left: `(N,)` control steps until a push begins; from 0 down those that it has lasted.
-        lasts: `(N,)` control steps of the next or present push.
-        force: `(N, 3)` N of the next or present push, world axes.
-        body: `(N,)` MuJoCo's body that it is on.
-    """
-
-    def __init__(self, pushes: Pushes, backend: Backend):
-        self.pushes, n, here = pushes, backend.num_envs, backend.device
+    def enter(self, goal: Goal, backend: Backend) -> None:
+        n, here = backend.num_envs, backend.device
         self._backend = backend
-        self._rng = torch.Generator().manual_seed(pushes.seed)
+        self._rng = torch.Generator().manual_seed(self.seed)
         self.left = torch.zeros(n, dtype=torch.long, device=here)
         self.lasts = torch.zeros_like(self.left)
         self.body = torch.zeros(n, dtype=torch.long, device=here)
@@ -162,8 +140,8 @@ class Pushing(Force):
         """Episodes begin with a time without a push; some have none at all."""
         rows = torch.arange(len(self.left), device=self.left.device)[episodes.rows]
         self._draw(rows)
-        if self.pushes.share < 1.0:
-            none = torch.rand(len(rows), generator=self._rng) >= self.pushes.share
+        if self.share < 1.0:
+            none = torch.rand(len(rows), generator=self._rng) >= self.share
             self.left[rows[none.to(rows.device)]] = NEVER
 
     def before_step(self, drive: Drive) -> bool:
@@ -202,19 +180,19 @@ class Pushing(Force):
             self._rng.set_state(state["push/rng"])
 
     def _draw(self, ids: Tensor) -> None:
-        p, n = self.pushes, len(ids)
+        n = len(ids)
         unit = torch.rand(3, n, generator=self._rng)
-        pick = torch.randint(len(p.bodies), (n,), generator=self._rng)
-        wait = p.every_s[0] + (p.every_s[1] - p.every_s[0]) * unit[0]
-        size = p.newtons[0] + (p.newtons[1] - p.newtons[0]) * unit[1]
+        pick = torch.randint(len(self.bodies), (n,), generator=self._rng)
+        wait = self.every_s[0] + (self.every_s[1] - self.every_s[0]) * unit[0]
+        size = self.newtons[0] + (self.newtons[1] - self.newtons[0]) * unit[1]
         angle = 2 * torch.pi * unit[2]
-        low, high = p.lasting
+        low, high = self.lasting
         lasts = torch.full((n,), low)
         if high > low:
             lasts = low * (high / low) ** torch.rand(n, generator=self._rng)
-        size = size.clamp_max(p.impulse_ns / lasts)
+        size = size.clamp_max(self.impulse_ns / lasts)
         force = torch.stack((size * angle.cos(), size * angle.sin(), 0 * size), 1)
-        self.left[ids] = (wait * p.control_hz).round().long().clamp_min(1).to(self.left.device)
-        self.lasts[ids] = (lasts * p.control_hz).round().long().clamp_min(1).to(self.left.device)
+        self.left[ids] = (wait * self.control_hz).round().long().clamp_min(1).to(self.left.device)
+        self.lasts[ids] = (lasts * self.control_hz).round().long().clamp_min(1).to(self.left.device)
         self.force[ids] = force.to(self.force)
-        self.body[ids] = (torch.tensor(p.bodies)[pick] + 1).to(self.body.device)
+        self.body[ids] = (torch.tensor(self.bodies)[pick] + 1).to(self.body.device)

@@ -10,7 +10,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.formats.guess import UPS
 from poise.formats.limited import read_limited
-from poise.formats.people import chosen
+from poise.formats.one_person import chosen
 from poise.formats.point_raw import UNITS_M, RawPoints
 from poise.formats.raw import UNSTATED, ReadOptions
 from poise.formats.text import CUT_OFF, check_file, shown

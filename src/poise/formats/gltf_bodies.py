@@ -10,7 +10,7 @@ from poise.errors import PoiseError
 from poise.formats.gltf_file import GltfFile, index_of
 from poise.formats.gltf_tracks import Tree
 from poise.formats.text import MAX_JOINTS, listed, others_note, shown
-from poise.motion.info import landmarks
+from poise.motion.clip_info import landmarks
 
 #: A skin of fewer joints that hangs on no other, such as a sword's, is no second body to be named.
 _BODY_JOINTS = 8

@@ -11,7 +11,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.formats.text import listed
-from poise.motion.info import landmarks
+from poise.motion.clip_info import landmarks
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 
 UPS = ("Y", "Z", "X", "-Y", "-Z", "-X")

@@ -23,9 +23,9 @@ from poise.formats.arrays import (
     refuse_bad,
     require,
 )
+from poise.formats.one_person import one_of_dicts
 from poise.formats.opensim import is_opensim, read_loco
 from poise.formats.own import MARK, read_poise_npz, write_poise_npz
-from poise.formats.people import one_of_dicts
 from poise.formats.pickles import load_plain, loads_restricted, named_arrays
 from poise.formats.point_arrays import (
     CONTACTS,

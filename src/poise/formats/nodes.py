@@ -13,7 +13,7 @@ from poise.formats.guess import guess_unit, guess_up
 from poise.formats.raw import ReadOptions, vectors_from_z_up
 from poise.formats.root_joint import Carried, carried, size_of
 from poise.formats.text import REST_POSE, shown
-from poise.motion.info import body_height, sampled
+from poise.motion.clip_info import body_height, sampled
 from poise.motion.rotations import matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
 from poise.motion.skeleton import Skeleton, posed
 

@@ -12,7 +12,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.formats.arrays import numeric, one_number, require, text_of
 from poise.formats.guess import UPS
-from poise.formats.people import MOST_PEOPLE, one_person
+from poise.formats.one_person import MOST_PEOPLE, one_person
 from poise.formats.point_raw import RawPoints
 from poise.formats.raw import UNSTATED, ReadOptions
 from poise.formats.refused import FLAT_HINT

@@ -22,14 +22,14 @@ from poise.formats.guess import (
 )
 from poise.formats.landmarks import places_of
 from poise.formats.markers import NEEDED, SIDES, middle_label
-from poise.formats.people import person_of
+from poise.formats.one_person import person_of
 from poise.formats.point_fit import FitConfig, fit_clip
 from poise.formats.point_noise import runs
 from poise.formats.raw import ReadOptions, evidence, vectors_to_z_up
 from poise.formats.refused import FLAT_HINT
 from poise.formats.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, listed, shown
 from poise.motion.clip import Clip, check_poses, check_rate
-from poise.motion.info import body_height, sampled
+from poise.motion.clip_info import body_height, sampled
 from poise.motion.keypoints import Keypoints
 from poise.motion.skeleton import Source
 

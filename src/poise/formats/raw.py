@@ -24,7 +24,7 @@ from poise.formats.guess import (
 from poise.formats.root_joint import beside_note
 from poise.formats.text import MAX_JOINTS, shown
 from poise.motion.clip import Clip, check_frames, check_poses, check_rate
-from poise.motion.info import body_height, sampled
+from poise.motion.clip_info import body_height, sampled
 from poise.motion.roles import SIDES, find_roles
 from poise.motion.rotations import normalize, unwrap_quats
 from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from poise.motion.info import landmarks
+from poise.motion.clip_info import landmarks
 from poise.motion.rotations import forward_kinematics, quat_rotate, quat_rotate_inv
 from poise.motion.skeleton import Skeleton, line_to_root, posed
 

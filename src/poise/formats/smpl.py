@@ -24,7 +24,7 @@ from poise.formats.guess import (
     lean,
     supports,
 )
-from poise.formats.people import MOST_PEOPLE, one_person
+from poise.formats.one_person import MOST_PEOPLE, one_person
 from poise.formats.raw import (
     RawMotion,
     ReadOptions,
@@ -39,7 +39,7 @@ from poise.formats.raw import (
 )
 from poise.formats.text import listed, write_whole
 from poise.motion.clip import Clip, check_poses
-from poise.motion.info import sampled
+from poise.motion.clip_info import sampled
 from poise.motion.rotations import matrix_to_quat, quat_conj, quat_mul, quat_to_rotvec, rotvec_to_quat
 from poise.motion.skeleton import Channel, Skeleton, Source, posed, triple
 

@@ -27,7 +27,7 @@ from poise.formats.raw import RawMotion, ReadOptions, assemble, quats_from_z_up,
 from poise.formats.root_joint import Restored, restored
 from poise.formats.text import MAX_JOINTS, MAX_VALUE, check_file, others_note, shown, write_whole
 from poise.motion.clip import MAX_POSES, Clip
-from poise.motion.info import landmarks
+from poise.motion.clip_info import landmarks
 from poise.motion.rotations import normalize, quat_mul, quat_rotate, unwrap_quats
 
 _EVEN_SCALE = 1e-2

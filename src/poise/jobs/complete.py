@@ -30,7 +30,7 @@ from poise.motion import Clip
 from poise.plan import LookaheadConfig
 from poise.settings import changed
 from poise.synthesis.filler import check_keyframes
-from poise.synthesis.inbetween import Partial, Retiming, moved_to, retimed, timed
+from poise.synthesis.keyframes import Partial, Retiming, moved_to, retimed, timed
 
 #: How much more a keyframe counts than the frames between.
 KEY_WEIGHT = 20.0

@@ -14,8 +14,8 @@ from poise.formats import home_suffix
 from poise.kinematics import anatomy_of, examine, hold_feet, lowest_height, qpos_to_clip, support_of
 from poise.kinematics.feet import stands_higher
 from poise.kinematics.hold import FASTEST, mend_slides
-from poise.kinematics.repair.doctor import new_faults
 from poise.kinematics.repair.faults import Fault
+from poise.kinematics.repair.motion_doctor import new_faults
 from poise.kinematics.repair.support import SOLE_M, slide_faults
 from poise.kinematics.repair.timing import body_steps
 from poise.metrics import jerk, success

@@ -31,7 +31,7 @@ from poise.learn import IterationStats, RunResult, Until
 from poise.learn.parallel import ALONE, Comm, joined, share_of, together
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.settings import changed
 
 

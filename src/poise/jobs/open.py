@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.get_up import RecoveryClips
 from poise.errors import PoiseError, did_you_mean
+from poise.jobs.deliver import Evaluation
 from poise.jobs.perpetual import perpetual_run
 from poise.jobs.run_file import (
     FINAL,
@@ -29,7 +30,7 @@ from poise.jobs.run_file import (
     policy_for,
     run_folder,
 )
-from poise.jobs.runs import Evaluation, evaluate, score, trained_policy, transitions
+from poise.jobs.runs import evaluate, score, trained_policy, transitions
 from poise.jobs.tracker import POLICIES, SHIPPED, Tracker, check_policy_file, load_tracker
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint
 from poise.learn.checkpoint import under
@@ -243,7 +244,7 @@ def _folder(folder: Path) -> Run:
     tensors, meta = load_checkpoint(path)
     if meta.get("kind") == "inbetween run":
         # It takes longer to import than a policy takes to open.
-        from poise.jobs.inbetween.inbetween_training import Inbetween
+        from poise.jobs.inbetween.inbetween_settings import Inbetween
 
         check_data(InbetweenMeta, meta, path)
         return Run(folder, INBETWEEN, from_data(Inbetween, meta["config"], path))

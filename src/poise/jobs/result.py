@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from poise.jobs.track.in_place import InPlace
     from poise.jobs.track.placement import Clean, PlacedMotion
     from poise.jobs.track.pushed import Pushed
-    from poise.jobs.track.recovering import ChainPart, Losses
+    from poise.jobs.track.recovery_run import ChainPart, Losses
     from poise.jobs.track.simulation import Simulation
     from poise.jobs.tracker import Tracker
     from poise.kinematics.supports import Support
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from poise.plan import SamplingResult
     from poise.recipes.imitation import Imitation
     from poise.score.report import Report
-    from poise.synthesis.inbetween import FilledClips, Retiming
+    from poise.synthesis.keyframes import FilledClips, Retiming
     from poise.synthesis.rounds import GapFault
 
 #: What a result does not have, where its type says that others do.

@@ -26,6 +26,7 @@ from poise.body.humanoid import make_humanoid
 from poise.env.help import scale_in
 from poise.errors import PoiseError
 from poise.formats.own import pack_clips, unpack_clips
+from poise.jobs.library.files import same_library
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy, save_checkpoint
 from poise.motion import ClipLibrary, Skeleton
 from poise.settings import to_data
@@ -193,7 +194,8 @@ def held_run(
     Args:
         recipe, config: its name and its settings.
         read: makes the settings of what the file says, also of one of an earlier version.
-        library: its clips, where they are at hand. source: where they are from, where that is known.
+        library: its clips, where they are at hand. source: where they are from, where that is known; a
+            folder that was moved since is followed, see `same_library`.
 
     Raises:
         PoiseError: another recipe, other settings, another source, or other clips.
@@ -215,12 +217,13 @@ def held_run(
         raise PoiseError(
             what, folder, "Resume it as it is or choose another folder", code="settings-differ"
         )
-    if source is not None and file.meta.get("source", "") != source:
+    clips = file.meta["clips"]
+    was, names = file.meta.get("source", "").split(", "), [clip["name"] for clip in clips]
+    if source is not None and not same_library(was, source.split(", "), names):
         what = f"the folder holds a run on the library {file.meta.get('source') or 'of a program'}"
         raise PoiseError(
             what, folder, "Give that library, or choose another folder", code="library-differs"
         )
-    clips = file.meta["clips"]
     if library is not None and clips != _as_known(clips, library):
         more = f" and {len(clips) - 6} more" if len(clips) > 6 else ""
         what = f"the folder holds a run of other clips ({', '.join(c['name'] for c in clips[:6])}{more})"

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.get_up import RecoveryClips
 from poise.errors import PoiseError
 from poise.formats.own import pack_clips, unpack_clips
 from poise.jobs.library.clips import Target
@@ -77,8 +77,8 @@ class Tracker:
             gave), "poise" (the version that wrote it).
         recovery_clips: by which the policy comes back where it has lost a motion; None if it has not
             learned that.
-        value: what its critic tells of a state, by which `track.recovering` looks ahead; None where the
-            critic was not kept.
+        value: what its critic tells of a state, by which `track.recovery_run` looks ahead; None where
+            the critic was not kept.
         onto: how motions pass onto the body; None for those of any size, as `retarget` does by itself.
     """
 

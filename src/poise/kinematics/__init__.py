@@ -12,10 +12,10 @@ from poise.kinematics.ik_frames import CORRECTIONS, IkConfig
 from poise.kinematics.limbs import limb_of, match_positions
 from poise.kinematics.loops import close_cycle, cycle_step, cycle_velocity
 from poise.kinematics.place import place_on_body
-from poise.kinematics.repair.doctor import Examination, examine, heal, without_noise
 from poise.kinematics.repair.estimate import clean_clip, find_faults
 from poise.kinematics.repair.faults import Fault, by_kind
 from poise.kinematics.repair.guesses import find_guesses, grounded
+from poise.kinematics.repair.motion_doctor import Examination, examine, heal, without_noise
 from poise.kinematics.repair.support import anatomy_of, sole_slide, support_of
 from poise.kinematics.repair.turns import swap_sides
 from poise.kinematics.retarget.own_body import onto_own, own_body

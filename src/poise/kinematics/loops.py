@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.errors import PoiseError
 from poise.kinematics.coords import qpos_velocity
 from poise.kinematics.travel import moved_by
 from poise.motion import Clip
@@ -205,3 +206,83 @@ def _even(clip: Clip, k: int, period: int) -> Clip:
     clip = moved_by(clip, stays, angle)
     drift = (clip.root_pos[here] - clip.root_pos[before]).mean(0) * np.array([1.0, 1.0, 0.0])
     return clip.replaced(root_pos=clip.root_pos - share[:, None] * drift)
+
+
+#: A loop may last this share longer or shorter than asked; s in which its end becomes its start; s by
+#: which a difference of speeds counts as one of places.
+LENIENT, JOINS_S, SPEED_S = 0.1, 0.6, 0.15
+
+
+def cut_loop(
+    clip: Clip, seconds: float, without: Sequence[tuple[float, float]] = ()
+) -> tuple[Clip, float]:
+    """The part of a long motion of about so many seconds whose end meets its start best, as a cycle.
+
+    Frames i and j are alike where places and speeds of all joints are, seen from the root's heading and
+    place on the floor. Up to frame j the motion passes over into that up to frame i, set on its heading
+    and place, with a share s as smooth as s'' = 0 at both ends. So the last frame is the first one, a
+    turn and a way on the floor later, at the same speed.
+
+    Args:
+        seconds: of the loop; it may last a tenth longer or shorter.
+        without: spans of time, s, of which the loop holds nothing.
+
+    Returns:
+        the loop, cyclic; the mean distance of the joints of the two frames, m.
+
+    Raises:
+        PoiseError: the motion holds no part that is long enough.
+    """
+    fps, pos = clip.fps, clip.positions()
+    joins, wanted = max(2, round(JOINS_S * fps)), seconds * fps
+    near = _from_root(clip, pos)
+    speed = np.gradient(near, 1.0 / fps, axis=0) * SPEED_S
+    # What the root does on the floor is no difference of places, but one of speeds.
+    way = np.gradient(clip.root_pos, 1.0 / fps, axis=0)
+    turn = quat_conj(heading_quat(torch.tensor(clip.rot[:, 0])))
+    speed += (quat_rotate(turn, torch.tensor(way)).numpy() * SPEED_S)[:, None]
+    alike = np.concatenate((near, speed), 1).reshape(clip.frames, -1)
+    kept = np.ones(clip.frames, dtype=bool)
+    for start, stop in without:
+        kept[max(0, math.floor(start * fps)) : math.ceil(stop * fps) + 1] = False
+    # Frames since the last one that is not to be in it.
+    free = np.arange(clip.frames) - np.maximum.accumulate(np.where(kept, -1, np.arange(clip.frames)))
+    best: tuple[float, int, int] | None = None
+    for length in range(math.ceil((1 - LENIENT) * wanted), math.floor((1 + LENIENT) * wanted) + 1):
+        ends = np.flatnonzero(free > length + joins)
+        if not len(ends) or length <= joins:
+            continue
+        gap = np.square(alike[ends] - alike[ends - length]).mean(1)
+        k = int(gap.argmin())
+        if best is None or gap[k] < best[0]:
+            best = float(gap[k]), int(ends[k]) - length, int(ends[k])
+    if best is None:
+        raise PoiseError(
+            f"the motion of {clip.frames / fps:.1f} s holds no {seconds:g} s in a row for a loop",
+            clip.name, "Make a longer one, or ask for a shorter loop", code="clip-too-short",
+        )  # fmt: skip
+    _, i, j = best
+    here, before = np.arange(i, j + 1), np.arange(j - joins, j + 1) - (j - i)
+    first, last = (torch.tensor(clip.rot[k, 0]) for k in (i, j))
+    onto = quat_mul(heading_quat(last), quat_conj(heading_quat(first)))
+    turns = onto.expand(len(before), 4)
+    along = quat_rotate(turns, torch.tensor(clip.root_pos[before] - clip.root_pos[i]))
+    along += torch.tensor(clip.root_pos[j] * [1.0, 1.0, 0.0] + clip.root_pos[i] * [0.0, 0.0, 1.0])
+    turned = torch.tensor(clip.rot[before])
+    turned[:, 0] = quat_mul(turns, turned[:, 0])
+    s = np.linspace(0.0, 1.0, joins + 1)
+    share = torch.tensor(s**3 * (10 - 15 * s + 6 * s * s))
+    root, rot = clip.root_pos[here].copy(), clip.rot[here].copy()
+    tail = slice(-joins - 1, None)
+    root[tail] += (share[:, None] * (along - torch.tensor(root[tail]))).numpy()
+    wide = share[:, None].expand(-1, rot.shape[1])
+    rot[tail] = slerp(torch.tensor(rot[tail]), turned, wide).numpy()
+    apart = float(np.linalg.norm(near[i] - near[j], axis=-1).mean())
+    return clip.replaced(root_pos=root, rot=rot, cyclic=True), apart
+
+
+def _from_root(clip: Clip, pos: np.ndarray) -> np.ndarray:
+    """`(T, J, 3)` m, joints seen from below the root, where it faces."""
+    turn = quat_conj(heading_quat(torch.tensor(clip.rot[:, 0])))[:, None]
+    flat = pos - pos[:, :1] * [1.0, 1.0, 0.0]
+    return quat_rotate(turn.expand(-1, pos.shape[1], 4), torch.tensor(flat)).numpy()

@@ -14,8 +14,8 @@ from poise.kinematics.feet import Levelled, level_feet
 from poise.kinematics.forward import Kinematics, lowest_height
 from poise.kinematics.ground import GroundFit, fit_ground
 from poise.kinematics.loops import Cycle, join_cycle
-from poise.kinematics.repair.doctor import without_noise
 from poise.kinematics.repair.estimate import CleanReport, clean_clip
+from poise.kinematics.repair.motion_doctor import without_noise
 from poise.kinematics.retarget.retarget_report import RetargetReport
 from poise.kinematics.retarget.transfer import RetargetConfig, retarget
 from poise.motion import Clip, ClipLibrary, Skeleton, resample

@@ -22,7 +22,7 @@ from poise.learn.protocols import (
 )
 from poise.learn.rollout import Rollout, TrainingError
 from poise.learn.run import Log, RunResult, Until, run
-from poise.learn.train import IterationStats, Trainer
+from poise.learn.trainer import IterationStats, Trainer
 
 __all__ = [
     "LAST_GOOD",

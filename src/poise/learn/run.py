@@ -20,7 +20,7 @@ from poise.errors import PoiseError
 from poise.learn.checkpoint import LAST_GOOD, LATEST, remove_partial, write_atomic
 from poise.learn.parallel import any_of, together
 from poise.learn.rollout import TrainingError
-from poise.learn.train import IterationStats, Trainer
+from poise.learn.trainer import IterationStats, Trainer
 from poise.settings import Range, validate
 
 CSV_NAME = "log.csv"

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.recovery.clips import GetUpPlanner, mixed, smooth
+from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.env.recovery.planner import way_to_stand
 from poise.env.recovery.recovering import RecoveryPhases
 from poise.live.people import Offset

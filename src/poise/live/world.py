@@ -17,15 +17,15 @@ from torch import Tensor
 from poise.control import Compliance
 from poise.env.events import Felt, Force
 from poise.env.goal import Goal
-from poise.env.recovery.clips import GetUpPlanner
-from poise.env.stream import StreamGoal
+from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.stream_goal import StreamGoal
 from poise.env.yielding import Yielding
 from poise.errors import PoiseError
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.live.characters import FALLS, CharacterGoals, CharacterState
-from poise.live.lookahead import AheadAtOnce, AheadBeside
+from poise.live.lookahead_process import AheadAtOnce, AheadBeside
 from poise.live.people import Own
 from poise.sim import Backend, CharacterRows, Drive, Scene, SceneSim, alone
 from poise.sim import Character as Actor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -11,11 +12,13 @@ import torch
 from torch import Tensor
 
 from poise.control import ExplicitResidual
-from poise.env.env import ImitationEnv
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.motion.rotations import GRAVITY, heading_quat, quat_rotate_inv
 from poise.plan.guide import Guide, Spring
+
+if TYPE_CHECKING:
+    from poise.env.env import ImitationEnv
 
 
 class TouchPoints:

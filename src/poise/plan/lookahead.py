@@ -5,13 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
-from poise.env.env import ImitationEnv, Snapshot
-from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.kinematics.forward import shapes_of
 from poise.machine import one_thread
@@ -20,6 +18,10 @@ from poise.metrics.plausibility import foot_contacts, jerk
 from poise.metrics.shape_points import Shapes, foot_points
 from poise.plan.sampling import draw_offsets
 from poise.settings import Count, Length, NotNegative, Range, Share, validate
+
+if TYPE_CHECKING:
+    from poise.env.env import ImitationEnv, Snapshot
+    from poise.env.task import Acts
 
 #: m/s^3, the mean jerk below which a reference counts as calm.
 CALM = 50.0

@@ -11,17 +11,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor
 
-from poise.env.env import ImitationEnv
-from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.machine import one_thread
 from poise.metrics import has_lost, mpjpe_global
 from poise.settings import Count, Range, validate
+
+if TYPE_CHECKING:
+    from poise.env.env import ImitationEnv
+    from poise.env.task import Acts
 
 
 @dataclass(frozen=True)

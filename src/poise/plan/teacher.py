@@ -15,18 +15,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor
 
-from poise.env.env import ImitationEnv
 from poise.env.frame import Pose
 from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.plan.lookahead import PAST, Candidates, Changes
 from poise.plan.sampling import draw_offsets
 from poise.settings import Count, NotNegative, Range, Share, validate
+
+if TYPE_CHECKING:
+    from poise.env.env import ImitationEnv
 
 
 @dataclass(frozen=True)

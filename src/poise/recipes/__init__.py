@@ -9,7 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from poise.recipes.residual_force import RECIPE, ResidualForce, build
+    from poise.recipes.residual_force import RECIPE, build
+    from poise.recipes.residual_force_settings import ResidualForce
 
 __all__ = ["RECIPE", "ResidualForce", "build"]
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
 from torch import Tensor
@@ -32,8 +32,10 @@ from poise.kinematics import clean_clip, place_on_body
 from poise.kinematics.fit import widen
 from poise.kinematics.retarget.own_body import own_table
 from poise.motion import Clip, ClipLibrary, Skeleton
-from poise.recipes.imitation import Imitation
 from poise.settings import Range, validate
+
+if TYPE_CHECKING:
+    from poise.recipes.imitation import Imitation
 
 #: Kinds of parts that are scaled together.
 GROUPS: tuple[tuple[str, ...], ...] = (

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from poise.body import BodyConfig, BodyTable, Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
-from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.get_up import RecoveryClips
 from poise.errors import PoiseError
 from poise.kinematics import FitReport, fit_humanoid
 from poise.kinematics.place import calm_library, on_own_body

@@ -38,7 +38,7 @@ from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskCo
 from poise.env import observations as obs
 from poise.env import rewards as reward
 from poise.env.pushes import Pushes
-from poise.env.recovery.clips import QUICK, RecoveryClips, find_recovery_clips
+from poise.env.recovery.get_up import QUICK, RecoveryClips, find_recovery_clips
 from poise.env.rewards import recovery_terms
 from poise.errors import PoiseError
 from poise.kinematics import place_on_body

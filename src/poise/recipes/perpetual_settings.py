@@ -62,7 +62,7 @@ class RecoveryPlan(Checked):
             and some walk, see `env.recovery.planner`; 0 learns to come back to a point, as the paper
             does.
         demonstration_share: of the episodes of a stage that tracks and recovers, how many are of them.
-        quick: they get up and walk back a second sooner, see `env.recovery.clips.QUICK`.
+        quick: they get up and walk back a second sooner, see `env.recovery.get_up.QUICK`.
         trials, final_trials: of each kind of fail-state, at evaluations and with the finished policy.
         seconds: a character counts as back within each of these times; the last one decides.
         enough: share of all trials with which recovery is learned.

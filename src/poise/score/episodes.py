@@ -19,7 +19,7 @@ from poise.errors import PoiseError
 from poise.formats.text import write_whole
 from poise.kinematics.forward import shapes_of
 from poise.machine import one_thread
-from poise.motion.rotations import quat_mul, rotvec_to_quat
+from poise.motion.rotations import quat_mul, quat_rotate, rotvec_to_quat
 from poise.score.rollouts import RolloutSet
 from poise.sim import UnstableError
 
@@ -29,6 +29,54 @@ PADDED = 100_000
 LEAST_S = 1.0
 #: rad, by which joint angles and the root's rotation of perturbed starts are off (one deviation).
 OFF_RAD = 1e-3
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Normal deviations of a start from the reference.
+
+    Attributes:
+        joints_rad: of the hinges and of the root's turn about each axis.
+        place_m: of the root on the floor, along X and Y.
+        velocity_m_s: of the root's velocity along each axis.
+        turning_rad_s: of the root's and the hinges' speeds of turning.
+        heading_rad: of the whole character about the vertical through its root.
+    """
+
+    joints_rad: float = 0.05
+    place_m: float = 0.03
+    velocity_m_s: float = 0.1
+    turning_rad_s: float = 0.2
+    heading_rad: float = 0.0
+
+    def __str__(self) -> str:
+        heading = f", {self.heading_rad:g} rad of heading" if self.heading_rad else ""
+        return (
+            f"starts off by {self.joints_rad:g} rad, {self.place_m:g} m, {self.velocity_m_s:g} m/s, "
+            f"{self.turning_rad_s:g} rad/s{heading}"
+        )
+
+    def move(self, qpos: Tensor, qvel: Tensor, rng: np.random.Generator) -> None:
+        """Moves a state `(7 + n,)` and `(6 + n,)` in place, by one draw of each deviation."""
+        turn = torch.as_tensor(rng.normal(scale=self.joints_rad, size=len(qvel) - 3)).to(qpos)
+        qpos[3:7] = quat_mul(qpos[3:7], rotvec_to_quat(turn[:3]))
+        qpos[7:] += turn[3:]
+        if self.place_m:
+            qpos[:2] += torch.as_tensor(rng.normal(scale=self.place_m, size=2)).to(qpos)
+        if self.velocity_m_s:
+            qvel[:3] += torch.as_tensor(rng.normal(scale=self.velocity_m_s, size=3)).to(qvel)
+        if self.turning_rad_s:
+            turning = rng.normal(scale=self.turning_rad_s, size=len(qvel) - 3)
+            qvel[3:] += torch.as_tensor(turning).to(qvel)
+        if self.heading_rad:
+            about = torch.tensor([0.0, 0.0, rng.normal(scale=self.heading_rad)]).to(qpos)
+            qpos[3:7] = quat_mul(rotvec_to_quat(about), qpos[3:7])
+            # The root's linear velocity is the world's, its angular velocity the root's own.
+            qvel[:3] = quat_rotate(rotvec_to_quat(about), qvel[:3])
+
+
+#: Starts that differ enough for the simulation to go another way, and no more.
+HAIR = Spread(OFF_RAD, 0.0, 0.0, 0.0)
 
 
 class Nothing:
@@ -120,25 +168,24 @@ def frames_from(reference: Reference, clip: Tensor, start: Tensor, cycles: int =
     return (reference.length.cpu()[clip] - 1) * rounds - start + 1
 
 
-def perturb(env: ImitationEnv, clip: Tensor, start: Tensor, trial: Tensor) -> Tensor:
-    """Turns all joints and the root of characters that stand on their starts by about `OFF_RAD`.
+def perturb(
+    env: ImitationEnv, clip: Tensor, start: Tensor, trial: Tensor, spread: Spread = HAIR
+) -> Tensor:
+    """Moves characters that stand on their starts off them.
 
     Args:
         clip, start, trial: `(N,)` long; what a world draws depends on its own three numbers alone.
+        spread: by how much.
 
     Returns:
         observations `(N, O)`.
     """
     state = env.backend.state
-    turns = state.qvel.new_zeros(env.num_envs, state.qvel.shape[1] - 3)
+    qpos, qvel = state.qpos.clone(), state.qvel.clone()
     numbers = cast("list[list[int]]", torch.stack((clip, start, trial), 1).tolist())
     for i, own in enumerate(numbers):
-        drawn = np.random.default_rng(own).normal(scale=OFF_RAD, size=turns.shape[1])
-        turns[i] = torch.as_tensor(drawn)
-    qpos = state.qpos.clone()
-    qpos[:, 3:7] = quat_mul(qpos[:, 3:7], rotvec_to_quat(turns[:, :3]))
-    qpos[:, 7:] += turns[:, 3:]
-    env.backend.write(None, qpos, state.qvel.clone())
+        spread.move(qpos[i], qvel[i], np.random.default_rng(own))
+    env.backend.write(None, qpos, qvel)
     return env.observe()
 
 
@@ -151,6 +198,7 @@ def run_episodes(
     cycles: int = 2,
     observers: Sequence[Observer] = (),
     trial: Tensor | None = None,
+    spread: Spread = HAIR,
 ) -> tuple[RolloutSet, list[Recording]]:
     """Every episode simulated to the end of its clip (cyclic clips: `cycles` rounds), failed or not.
 
@@ -164,6 +212,7 @@ def run_episodes(
         observers: watch beside the recorder.
         trial: `(E,)` which of several perturbed starts each is, see `perturb`; None leaves characters
             exactly on their starts.
+        spread: of perturbed starts.
 
     Returns:
         the padded rollouts (frame 0 is the start itself, before any action) and, for each clip's
@@ -178,7 +227,7 @@ def run_episodes(
     try:
         obs = env.reset_to(clip, start)
         if trial is not None:
-            obs = perturb(env, clip, start, trial)
+            obs = perturb(env, clip, start, trial, spread)
         recorder = Recorder(env, clip, start, cycles, trial)
         try:
             simulate(env, policy, obs, recorder.total - 1, recorder, *observers)

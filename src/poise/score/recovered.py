@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Recovery, Reference, TaskConfig
-from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.clock import FALLEN, FAR, RecoveryClock
+from poise.env.recovery.get_up import RecoveryClips
 from poise.env.recovery.recovering import Recovering
 from poise.errors import PoiseError
 from poise.score.episodes import simulate

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated
 
 import mujoco
@@ -20,6 +21,7 @@ import mujoco
 from poise.body import Humanoid
 from poise.body.humanoid import add_humanoid
 from poise.errors import PoiseError, did_you_mean
+from poise.formats.text import write_whole
 from poise.settings import Length, validate
 from poise.sim.backend import SimConfig
 from poise.sim.floor import Floor, Plane
@@ -28,6 +30,8 @@ from poise.sim.props import Prop
 
 #: Things in one scene; more take minutes to compile and are a mistake.
 MOST = 500
+#: Impedance d of contacts between two characters, see MuJoCo's `solimp`.
+FLESH = 0.5
 _BITS = ("FOUND", "FORCE", "TORQUE", "POS")
 _DATA = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{bit}")) for bit in _BITS)
 _NETFORCE = 3
@@ -116,6 +120,8 @@ class Scene:
                 add_humanoid(spec, thing.humanoid.table, thing.prefix)
             else:
                 thing.add(spec)
+        if len(characters) > 1:
+            _soften(spec, characters)
         known = [b.name for b in spec.bodies]
         for link in self.links:
             for body in (link.a, link.b):
@@ -193,6 +199,21 @@ def alone(humanoid: Humanoid, sim: SimConfig | None = None) -> mujoco.MjModel:
     return Scene((Character(humanoid),), sim=sim or SimConfig()).compile().model
 
 
+def _soften(spec: mujoco.MjSpec, characters: tuple[Character, ...]) -> None:
+    """Gives contacts between bodies of characters the impedance `FLESH`; all others keep their own.
+
+    A limb that is wedged between two of another character has contacts that push against each other. The
+    solver shares d / (1 - d) of what both ask for among them: 9 to 19 times with MuJoCo's d, up to
+    200,000 N between two people, and once with a half.
+    """
+    for character in characters:
+        for name in character.humanoid.bodies:
+            for geom in spec.body(character.prefix + name).geoms:
+                # Parameters of a pair are mixed by weight, and 0 against anything counts nothing.
+                geom.solmix = 0.0
+                geom.solimp[:2] = [FLESH, FLESH]
+
+
 def _check(name: str, known: list[str], where: str) -> None:
     if name not in known:
         raise PoiseError(
@@ -223,3 +244,23 @@ class SceneModel:
             hint = did_you_mean(name, list(self.places))
             raise PoiseError(f"there is no '{name}' in the scene", "Scene", hint, code="unknown-thing")
         return self.places[name]
+
+
+def mjcf_of(humanoid: Humanoid, sim: SimConfig | None = None) -> str:
+    """A body as MJCF: on a floor, a position servo for every hinge, the settings of the physics.
+
+    `ctrl` are target angles in rad; lengths are m, masses kg, the vertical is Z. MuJoCo writes numbers
+    with six digits, so that the loaded model differs from the simulated one by 1e-6 of each.
+
+    sim: the physics; by default those of the recipes. A control step is `sim.substeps` of MuJoCo's.
+    """
+    spec = Scene((Character(humanoid),), sim=sim or SimConfig()).spec
+    # What is written is complete only after it was compiled.
+    spec.compile()
+    return spec.to_xml()
+
+
+def write_mjcf(humanoid: Humanoid, path: str | Path, sim: SimConfig | None = None) -> Path:
+    """Writes `mjcf_of` into a file, whole or not at all."""
+    write_whole(Path(path), mjcf_of(humanoid, sim))
+    return Path(path)

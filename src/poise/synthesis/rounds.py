@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from poise.kinematics.feet import Motion
-from poise.kinematics.repair.doctor import examine, heal
 from poise.kinematics.repair.faults import KINDS
+from poise.kinematics.repair.motion_doctor import examine, heal
 from poise.motion import Clip
 from poise.motion.rotations import slerp
 from poise.motion.smoothing import smoothstep

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from poise.env import Reference
-from poise.env.recovery.clips import CALM, LIFT, QUICK, GetUpPlanner, RecoveryClips, find_recovery_clips
+from poise.env.recovery.get_up import CALM, LIFT, QUICK, GetUpPlanner, RecoveryClips, find_recovery_clips
 from poise.env.recovery.planner import (
     SPEEDS_UP,
     STOPS,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
-from poise.env.recovery.clips import QUICK, RecoveryClips
+from poise.env.recovery.get_up import QUICK, RecoveryClips
 from poise.env.recovery.planner import entry
 from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering, RecoveryPhases
 from poise.recipes.imitation import Imitation

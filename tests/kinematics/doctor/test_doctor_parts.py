@@ -15,8 +15,8 @@ from poise.body import Anatomy
 from poise.formats import read_clip
 from poise.kinematics import anatomy_of, examine, find_guesses, fit_humanoid, grounded, heal, support_of
 from poise.kinematics.hold import mend_slides
-from poise.kinematics.repair.doctor import Examination, limit_faults, new_faults
 from poise.kinematics.repair.faults import KINDS, Fault, by_kind, spell_faults
+from poise.kinematics.repair.motion_doctor import Examination, limit_faults, new_faults
 from poise.kinematics.repair.speeds import trembling
 from poise.kinematics.repair.support import foot_slips, slide_faults
 from poise.kinematics.repair.timing import find_gaps, find_holds, mend_teleports

@@ -9,7 +9,7 @@ import pytest
 
 import poise
 from poise.formats import read_clip
-from poise.kinematics.repair.doctor import examine, heal
+from poise.kinematics.repair.motion_doctor import examine, heal
 from poise.kinematics.repair.timing import drift_faults, find_drift, mend_drift
 from poise.motion import Clip
 

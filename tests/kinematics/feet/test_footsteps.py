@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from poise.kinematics.feet import Motion, standing_heights
-from poise.kinematics.repair.doctor import examine
+from poise.kinematics.repair.motion_doctor import examine
 from poise.kinematics.steps import planned, stepped
 from poise.motion import Clip
 from poise.motion.rotations import forward_kinematics

@@ -14,7 +14,7 @@ from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.motions import BEGINS_S, FLIES_S, STANDS_S, G, hopping, hops
-from poise.papers.compliant.opponents import APART_M, Opposing, opposing, rival_stage, weighed
+from poise.papers.compliant.opponents import APART_M, Opponent, opposing, rival_stage, weighed
 from poise.papers.compliant.scenes import Chicken
 from poise.recipes.imitation import Imitation
 from refusals import refused
@@ -87,7 +87,7 @@ def test_an_opponent_out_of_reach_moves_as_if_it_were_alone(tracker: Tracker, ta
     lone = replace(far, task=replace(far.task, events=())).env(
         1, threads=1, auto_reset=False, help_scale=0.0, guard=False
     )
-    opposing_one = env.event(Opposing)
+    opposing_one = env.event(Opponent)
     assert opposing_one is not None
     zero = torch.zeros(2, dtype=torch.long)
     obs, other = env.reset_to(zero, zero), lone.reset_to(zero[:1], zero[:1])

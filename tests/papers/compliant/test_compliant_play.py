@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,15 @@ def test_a_pull_and_throws_are_seen(tracker: Tracker) -> None:
     thrown = play(Throws(every_s=(0.8, 0.8)), tracker, None, None, 3, seconds=1.6, threads=1)
     assert thrown.figures["force_peak_n"] > 50.0 and len(thrown.movers) == 1
     assert 1.0 < thrown.figures["impulse_ns"] < 10.0
+    # Starts differ, and the mean of the episodes is what is told.
+    off = thrown.evaluation.rollouts
+    apart = (off.pos[:, 0, 0] - off.ref_pos[:, 0, 0])[:, :2].norm(dim=-1)
+    assert float(apart.std()) > 0.01 and thrown.count == 3
+    assert thrown.figures["off_m"] == pytest.approx(thrown.episodes["off_m"].mean(), abs=1e-4)
+    assert not thrown.notes
+    torn = replace(thrown, episodes={**thrown.episodes, "force_peak_n": np.array([1.0, 9e5, 2.0])})
+    (note,) = torn.notes
+    assert "900,000 N" in note and "nobody bears" in note
 
 
 def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.control import Compliance, Stiffness
 from poise.env.pushes import Push
-from poise.env.scene import InScene, ScenePart
+from poise.env.scene_events import InScene, ScenePart
 from poise.env.yielding import DisplacedGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run
@@ -153,7 +153,7 @@ def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> Non
     place = sim.scene.place("trampoline")
     assert place.coordinates == 3 and place.controls.stop - place.controls.start == 4
     bounce = part.events[1](sim, 30.0)
-    assert isinstance(bounce, trampoline.Bouncing)
+    assert isinstance(bounce, trampoline.Bounce)
     ctrl = sim.backend.drive.ctrl[:, place.controls]
     up = list[int]()
     for step in range(150):

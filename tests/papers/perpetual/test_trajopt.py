@@ -13,7 +13,8 @@ from poise.env import ImitationEnv, Reference
 from poise.metrics import mpjpe_global
 from poise.papers.perpetual.trajopt import LqrTeacher, TrajectoryOptimizer, TrajOptConfig, segments
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.residual_force import build
+from poise.recipes.residual_force_settings import ResidualForce
 from poise.sim import SimConfig
 from refusals import refused
 from toy_human import swing

@@ -12,7 +12,7 @@ from poise.env import rewards as reward
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.papers.skeleton2humanoid.recipe import FALLS, INITIAL, LEFT, Budget, build, settings
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force_settings import ResidualForce
 from refusals import refused
 from toy_human import swing
 

@@ -1,6 +1,6 @@
 """Recovery motions: from where characters lie, up and over to where a motion is entered again.
 
-The recovery clips of a library (`env.recovery.clips`) give a recovery motion for any start:
+The recovery clips of a library (`env.recovery.get_up`) give a recovery motion for any start:
 
     lying -> blended -> a clip that gets up -> the walk, steered -> at ease
 
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.recovery.clips import GetUpPlanner, mixed, smooth
+from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.env.reference import Reference
 from poise.motion.rotations import facing, heading_angle, quat_mul, yaw_quat
 from poise.sim import displaced

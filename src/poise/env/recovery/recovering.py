@@ -14,9 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.env.generator import GeneratorGoal
+from poise.env.generator_goal import GeneratorGoal
 from poise.env.goal import ClipGoal, Goal
-from poise.env.recovery.clips import GetUpPlanner, RecoveryClips
+from poise.env.recovery.get_up import GetUpPlanner, RecoveryClips
 from poise.env.recovery.planner import entry, way_into, way_to_stand
 from poise.env.reference import Reference, Start
 from poise.metrics import has_lost

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
-from poise.env.generator import GeneratorGoal, Steering
+from poise.env.generator_goal import GeneratorGoal, Steering
 from poise.env.recovery.recovering import Recovering
 from poise.errors import PoiseError
 from poise.jobs.endless.dreamt import (
@@ -32,7 +32,7 @@ from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.controllers import NO_CRITIC, look_ahead
 from poise.jobs.track.placement import place
-from poise.jobs.track.supports import crowd, places
+from poise.jobs.track.surroundings import crowd, places
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.kinematics.rate import read_clip

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from poise.body import BodyTable, Humanoid
-from poise.env.generator import Steering
+from poise.env.generator_goal import Steering
 from poise.errors import PoiseError
 from poise.formats import check_writable, write_clip
 from poise.formats.text import write_whole
@@ -27,6 +27,7 @@ from poise.jobs.deliver import Delivery
 from poise.jobs.result import ABSENT, Result
 from poise.kinematics import hold_feet, lowest_height, qpos_to_clip
 from poise.kinematics.forward import Kinematics, shapes_of
+from poise.kinematics.loops import cut_loop
 from poise.metrics import foot_points, foot_slide, jerk, lowest_points, penetration
 from poise.motion import Clip
 from poise.plan import LookaheadConfig
@@ -234,6 +235,8 @@ def _part(clip: Clip, first: int, last: int) -> Clip:
     return clip.replaced(root_pos=clip.root_pos[first:last], rot=clip.rot[first:last])
 
 
+#: s before a fall and after getting up that no loop holds.
+FELL_S = 1.0
 #: s of the motion that a report shows.
 SHOWN_S = 60.0
 
@@ -274,6 +277,21 @@ class Dreamt(Result):
     def motion(self, character: int = 0) -> Clip:
         """A character's motion as it was simulated, on the body's skeleton."""
         return self.body.clip(self.characters[character].done.read(), "dream")
+
+    def loop(self, seconds: float) -> tuple[Clip, str]:
+        """A part of the first character's motion that can be repeated, standing feet held, and a
+        sentence on it; see `kinematics.loops.cut_loop`. Falls and getting up are not in it.
+
+        Raises:
+            PoiseError: the motion holds no such part.
+        """
+        clip = self.as_written(True).clips["simulated"].replaced(name="loop")
+        lost = sorted(t for i, t in self.lost if i == 0)
+        back = sorted(t for i, t in self.back if i == 0)
+        spans = [(t - FELL_S, next((b for b in back if b > t), self.seconds) + FELL_S) for t in lost]
+        found, apart = cut_loop(clip, seconds, spans)
+        lasts = (found.frames - 1) / found.fps
+        return found, f"The loop lasts {lasts:.2f} s; its ends were {apart * 1000:.0f} mm apart."
 
     @property
     def source(self) -> Clip:

@@ -33,6 +33,7 @@ from poise.jobs.endless.model import (
     spread,
 )
 from poise.jobs.library.clips import LibraryConfig
+from poise.jobs.library.files import same_library
 from poise.jobs.perpetual.perpetual_run import clips_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
@@ -283,7 +284,7 @@ def begin(
     if run.exists():
         motions, held, of = opened(run)
         wanted = to_data(config) | ({"steps": held.steps} if minutes is not None else {})
-        if of != said or to_data(held) != wanted:
+        if not same_library(of, said, motions.clips) or to_data(held) != wanted:
             what = "the folder holds a run of another library or with other settings"
             raise PoiseError(
                 what, folder, "Resume it as it is or choose another folder", code="run-differs"

@@ -16,7 +16,7 @@ from poise.jobs.result import Result, clip_of
 from poise.learn.inbetween_model import MODEL, InbetweenModel, load_model
 from poise.motion import Clip
 from poise.synthesis.filler import EACH_GAP, Filling, check_keyframes
-from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.keyframes import fill_keyframes
 
 
 def inbetween(

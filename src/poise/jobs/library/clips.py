@@ -16,8 +16,8 @@ from poise.jobs.library.files import MotionFile, check_patterns, matches
 from poise.kinematics import RetargetConfig, onto_own, own_body, place_on_body
 from poise.kinematics.place import OnBody
 from poise.kinematics.rate import judge_rate, read_clip
-from poise.kinematics.repair.doctor import without_noise
 from poise.kinematics.repair.estimate import clean_clip
+from poise.kinematics.repair.motion_doctor import without_noise
 from poise.kinematics.repair.needs import AloneRules, leaps, longest_alone, not_alone
 from poise.kinematics.travel import find_travel, travelled
 from poise.motion import Clip, Skeleton, resample, shifted, trim

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -76,6 +76,36 @@ def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFi
         unique = name if seen[name] == 1 else f"{name}-{seen[name]}"
         out.append(MotionFile(path, unique, subject_of(unique)))
     return out
+
+
+def same_library(was: Sequence[str], now: Sequence[str], clips: Iterable[str]) -> bool:
+    """Whether a run's library is the one that is stated now, also where it was moved since.
+
+    A folder or file that is no longer where it was is known again: a folder by the files that the run's
+    clips are from, wherever it is now and however it is called; another file, "onto FILE", by its name.
+
+    Args:
+        was, now: the folder or file, then words that tell how it is read.
+        clips: names of the run's clips.
+    """
+    if [*was] == [*now]:
+        return True
+    if not was or len(was) != len(now):
+        return False
+    onto = "onto "
+    for old, new in zip(was[1:], now[1:], strict=True):
+        here, there = Path(new.removeprefix(onto)), Path(old.removeprefix(onto))
+        both = old.startswith(onto) and new.startswith(onto)
+        if old != new and not (both and here.name == there.name and not there.exists()):
+            return False
+    old, new = Path(was[0]), Path(now[0])
+    if old == new or old.exists() or not new.exists():
+        return old == new
+    if new.is_file():
+        return old.name == new.name
+    files = {file.name.removeprefix(f"{new.name}-") for file in motion_files_of(new)}
+    known = (c.removesuffix(BACKWARDS).removesuffix(MIRRORED) for c in clips)
+    return all(name.removeprefix(f"{old.name}-") in files for name in known)
 
 
 def refuse_without_motion(given: Sequence[Path | str]) -> NoReturn:

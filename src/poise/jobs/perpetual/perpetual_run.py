@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.body import BodyConfig
-from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.get_up import RecoveryClips
 from poise.errors import PoiseError
 from poise.jobs.library.clips import LibraryConfig, Target
 from poise.jobs.library.folder import library_of, split

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, Recovery, Reference
-from poise.env.recovery.clips import GetUpPlanner
 from poise.env.recovery.falls import fall_states
+from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import recovery_motions
 from poise.env.task import Acts
 from poise.jobs.warm_start import CLONE_WORLDS, TrainingCallbacks, clone_expert, critic_first

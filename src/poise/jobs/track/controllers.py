@@ -15,9 +15,9 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.result import RULE, merit
 from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
-from poise.jobs.track.recovering import RecoveryRun, ReplayActions, led_along, look_for, replay
+from poise.jobs.track.recovery_run import RecoveryRun, ReplayActions, led_along, look_for, replay
 from poise.jobs.track.simulation import Simulation, States
-from poise.jobs.track.supports import crowd
+from poise.jobs.track.surroundings import crowd
 from poise.jobs.tracker import Tracker
 from poise.metrics import has_lost, success_rule
 from poise.plan import Lookahead, LookaheadConfig, SamplingConfig, SamplingResult

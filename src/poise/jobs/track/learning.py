@@ -18,7 +18,7 @@ from poise.jobs.result import RULE, Result, needs_of
 from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
 from poise.jobs.track.placement import PlacedMotion, place
-from poise.jobs.track.supports import Wanted, with_supports
+from poise.jobs.track.surroundings import Wanted, with_supports
 from poise.jobs.track.tracking import BESIDE, brought_home, imitation_of
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened

@@ -14,7 +14,7 @@ from poise.body import BodyTable, Humanoid
 from poise.control import Compliance, Stiffness
 from poise.control.compliance import Level, NewtonsPerMetre
 from poise.env import ImitationEnv
-from poise.env.pushes import OnePush, Push
+from poise.env.pushes import Push
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.rotations import quat_rotate
@@ -220,9 +220,9 @@ class PushSeen:
         """Keeps the frame `step`; it never needs more of them."""
         from poise.env.yielding import Yielding
 
-        part, yielding, goal = env.event(OnePush), env.event(Yielding), env.goal
+        part, yielding, goal = env.event(Push), env.event(Yielding), env.goal
         assert part is not None and yielding is not None and isinstance(goal, DisplacedGoal)
-        self._push, row = part.given, part.given.row
+        self._push, row = part, part.row
         acts = bool(part.acts[0])
         felt = part.felt()
         arrow = torch.cat((felt.point[0], felt.force[0]), 1).double().cpu().numpy()

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Reference
-from poise.env.recovery.clips import mixed
+from poise.env.recovery.get_up import mixed
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.result import RULE, Result, Way
 from poise.jobs.track.controllers import Show, StepProgress, TrackingRun, episode, look_ahead
-from poise.jobs.track.recovering import ReplayActions
+from poise.jobs.track.recovery_run import ReplayActions
 from poise.jobs.track.simulation import FILE, Retake, Simulation, States
 from poise.jobs.track_settings import TrackConfig
 from poise.jobs.tracker import Tracker

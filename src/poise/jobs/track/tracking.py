@@ -23,10 +23,11 @@ from poise.env import Reference
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.formats.raw import ReadOptions
+from poise.jobs.deliver import Evaluation
 from poise.jobs.deliver import settled as feet_settled
 from poise.jobs.open import Run, open_run
 from poise.jobs.result import RULE, Result, Way, needs_of
-from poise.jobs.runs import Evaluation, scored
+from poise.jobs.runs import scored
 from poise.jobs.track.controllers import Show, TrackingRun, done_by, led_by
 from poise.jobs.track.in_place import InPlace, with_travel
 from poise.jobs.track.placement import (
@@ -42,9 +43,9 @@ from poise.jobs.track.placement import (
 )
 from poise.jobs.track.pushed import with_push
 from poise.jobs.track.rates import rate_doubts, rate_notes
-from poise.jobs.track.recovering import RecoveryRun, cut, parts_of, with_parts
+from poise.jobs.track.recovery_run import RecoveryRun, cut, parts_of, with_parts
 from poise.jobs.track.retaking import as_it_was, retaken, write_simulation
-from poise.jobs.track.supports import places, with_supports, write_supports
+from poise.jobs.track.surroundings import places, with_supports, write_supports
 from poise.jobs.track_settings import TrackConfig
 from poise.jobs.tracker import Tracker
 from poise.kinematics.directed import Pin, pinned

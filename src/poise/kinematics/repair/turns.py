@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.body import Anatomy
 from poise.motion import Clip, Skeleton
-from poise.motion.info import sampled
+from poise.motion.clip_info import sampled
 from poise.motion.role_words import name_words, without_rig
 from poise.motion.rotations import (
     normalize,

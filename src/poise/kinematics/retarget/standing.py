@@ -13,7 +13,7 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.kinematics.feet import contact_labels
 from poise.motion import Clip, Roles
-from poise.motion.info import sampled
+from poise.motion.clip_info import sampled
 from poise.motion.roles import SIDES
 from poise.motion.rotations import (
     axis_angle_to_quat,

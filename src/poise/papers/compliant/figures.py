@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.control import Compliance, Stiffness
 from poise.env.events import Event, Felt, Force
-from poise.env.scene import ScenePart
+from poise.env.scene_events import ScenePart
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.jobs.tracker import Tracker

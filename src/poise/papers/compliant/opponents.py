@@ -16,10 +16,10 @@ from poise.control import Compliance, Stiffness
 from poise.env import Reference
 from poise.env.controls import steps
 from poise.env.env import ImitationEnv
-from poise.env.events import EpisodeStart, Event
+from poise.env.events import EpisodeStart, Event, StatedEvent
 from poise.env.frame import Frame, Observable
 from poise.env.goal import Goal
-from poise.env.scene import InScene, touches_of
+from poise.env.scene_events import InScene, touches_of
 from poise.env.task import Acts, EnvStep
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
@@ -36,13 +36,13 @@ from poise.recipes.imitation import Imitation
 from poise.sim import Backend, Character, CharacterRows, Drive, displaced
 
 
-@dataclass(frozen=True, eq=False)
-class Opponent:
+@dataclass(eq=False)
+class Opponent(StatedEvent[Goal, Backend], Event):
     """Given to `TaskConfig.events`: a character of the scene that another environment drives, step by
     step with the one that holds the event.
 
     Unlike `Teams` it lets one environment be looked at as any other; the other's episodes begin where
-    its clip does, with those of all worlds, and never end.
+    its clip does, with those of all worlds, and never end. At work it has that environment as `env`.
 
     Attributes:
         name: of the character in the scene.
@@ -54,23 +54,12 @@ class Opponent:
     make: Callable[[Backend], ImitationEnv]
     policy: Acts
 
-    def __call__(self, goal: Goal, backend: Backend) -> Opposing:
-        """The event of an environment."""
+    def enter(self, goal: Goal, backend: Backend) -> None:
         if not isinstance(backend, CharacterRows) or backend.sim is None or len(backend.places) != 1:
             what = "an opponent needs a scene with one character and itself in each world"
             raise PoiseError(what, f"Opponent '{self.name}'", code="scene-needed")
-        return Opposing(self, backend.sim.characters(self.name))
-
-
-class Opposing(Event):
-    """`Opponent` in N worlds.
-
-    Attributes:
-        env: its environment.
-    """
-
-    def __init__(self, given: Opponent, rows: CharacterRows):
-        self._policy, self._rows, self.env = given.policy, rows, given.make(rows)
+        rows = backend.sim.characters(self.name)
+        self._rows, self.env = rows, self.make(rows)
         self._zero = torch.zeros(rows.num_envs, dtype=torch.long, device=rows.device)
         self._obs = self.env.reset_to(self._zero, self._zero)
         self._held: tuple[Tensor, ...] | None = None
@@ -83,7 +72,7 @@ class Opposing(Event):
     def before_step(self, drive: Drive) -> bool:
         """Its action for the control step that begins."""
         actuation = self.env.controls.actuation
-        self.env.drive(self._policy.act(self._obs))
+        self.env.drive(self.policy.act(self._obs))
         more = actuation.before()
         self._held, self._first = actuation.held(), True
         self._rows.push()

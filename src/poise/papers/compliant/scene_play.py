@@ -22,11 +22,12 @@ from poise.env import ImitationEnv
 from poise.errors import PoiseError
 from poise.formats import write_clip
 from poise.formats.text import write_whole
-from poise.jobs.deliver import make_report, simulated_clip
+from poise.jobs.deliver import Evaluation, make_report, simulated_clip
 from poise.jobs.open import open_run
-from poise.jobs.runs import Evaluation, scored
+from poise.jobs.result import RULE
+from poise.jobs.runs import scored
 from poise.jobs.track import imitation_of
-from poise.jobs.track.controllers import RULE, look_ahead
+from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
@@ -41,6 +42,10 @@ from poise.score import run_episodes, write_score
 from poise.score.report import Mover, write_report
 from poise.score.rollouts import RolloutSet
 
+#: m/s^2; greatest force, in weights of a character, about which nothing is said.
+G, MOST_WEIGHTS = 9.81, 20.0
+#: Figures of which episodes are counted.
+COUNTS = frozenset(("lost", "opened", "touched", "rival_fell"))
 #: What the figures are, in words.
 WORDS = {
     "force_mean_n": "Interaction force, mean while it acts, N",
@@ -63,9 +68,8 @@ class Played:
         words: what the figures are, by their keys.
         imitation: the task of the compliant character.
         evaluation: its episodes and score.
-        figures, stiff: by the keys of `words`, of the compliant character and of its twin that does not
-            give way; means over the episodes, `lost` their count.
-        count: of the episodes of each.
+        episodes, stiff_episodes: `(E,)` by the keys of `words`, of the compliant character and of its
+            twin that does not give way; NaN where an episode has none.
         arrows: of each frame of the first episode `(K, 6)`: points, m, and forces felt there, N.
         movers: what moves in its world.
     """
@@ -74,11 +78,25 @@ class Played:
     words: Mapping[str, str]
     imitation: Imitation
     evaluation: Evaluation
-    figures: Mapping[str, float]
-    stiff: Mapping[str, float]
-    count: int
+    episodes: Mapping[str, np.ndarray]
+    stiff_episodes: Mapping[str, np.ndarray]
     arrows: tuple[np.ndarray, ...]
     movers: tuple[Mover, ...]
+
+    @property
+    def count(self) -> int:
+        """Episodes of each."""
+        return len(self.episodes["lost"])
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Means over the episodes of the compliant character; of `COUNTS` how many."""
+        return summed(self.episodes)
+
+    @property
+    def stiff(self) -> Mapping[str, float]:
+        """The same of its twin."""
+        return summed(self.stiff_episodes)
 
     @property
     def clip(self) -> Clip:
@@ -102,6 +120,18 @@ class Played:
             f"compliance ({b:.1f} N); {lost} were lost, {others} without."
         )
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence where a force is greater than people bear."""
+        most = max(float(np.nanmax(e["force_peak_n"])) for e in (self.episodes, self.stiff_episodes))
+        weight = self.imitation.humanoid.mass * G
+        if most <= MOST_WEIGHTS * weight:
+            return ()
+        return (
+            f"The greatest interaction force is {most:,.0f} N, {most / weight:.0f} times the "
+            "character's weight, which nobody bears: limbs are wedged, or a link is torn at.",
+        )
+
     def write(self, out: Path) -> dict[str, Path]:
         """`simulated.bvh`, `score.json`, `figures.json` and `report.html` in a folder."""
         out.mkdir(parents=True, exist_ok=True)
@@ -116,11 +146,21 @@ class Played:
         report = replace(
             report, title=_title(self.scene, report.title), movers=self.movers,
             pushes=self.arrows if len(self.arrows) == frames else (),
-            notes=(self.sentence(), *report.notes),
+            notes=(self.sentence(), *self.notes, *report.notes),
         )  # fmt: skip
         paths["report"] = out / "report.html"
         write_report(report, paths["report"])
         return paths
+
+
+def summed(episodes: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Means over episodes, of `COUNTS` how many; 0 where no episode has a figure."""
+    out = dict[str, float]()
+    for name, values in episodes.items():
+        known = values[~np.isnan(values)]
+        value = known.sum() if name in COUNTS else known.mean() if len(known) else 0.0
+        out[name] = round(float(value), 4)
+    return out
 
 
 def play(
@@ -136,7 +176,7 @@ def play(
     controller: Literal["policy", "lookahead"] = "policy",
     lookahead: LookaheadConfig | None = None,
 ) -> Played:
-    """A scene with compliance and without, from starts that differ by a hair.
+    """A scene with compliance and without, from the same starts, which are off by `scene.starts`.
 
     Args:
         policy: see `poise.track`.
@@ -162,6 +202,9 @@ def play(
             code="settings-conflict",
         )
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
+    if scene.rate_hz is not None:
+        sim = replace(tracker.config.sim, rate_hz=max(scene.rate_hz, tracker.config.sim.rate_hz))
+        tracker = replace(tracker, config=replace(tracker.config, sim=sim))
     own_motion = motion_of(scene, tracker, seconds)
     if clip is not None and own_motion is not None:
         raise PoiseError(
@@ -195,7 +238,8 @@ def play(
     called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
     return Played(
         called, {**WORDS, **words_of(scene)}, imitation, evaluation,
-        looked.figures(rollouts, task), other.figures(others, task), count,
+        {k: v.numpy() for k, v in looked.figures(rollouts, task).items()},
+        {k: v.numpy() for k, v in other.figures(others, task).items()},
         tuple(looked.arrows), looked.movers(),
     )  # fmt: skip
 
@@ -229,7 +273,7 @@ def _episodes(
     try:
         rollouts, recordings = run_episodes(
             make, ahead or topped or tracker.policy, zero, zero, cycles=1, observers=[watch],
-            trial=torch.arange(count),
+            trial=torch.arange(count), spread=scene.starts,
         )  # fmt: skip
     finally:
         if ahead is not None:

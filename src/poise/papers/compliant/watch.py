@@ -4,7 +4,6 @@
 # pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
@@ -15,16 +14,16 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.events import Felt, Force
-from poise.env.scene import ScenePart
+from poise.env.scene_events import ScenePart
 from poise.env.yielding import DisplacedGoal
-from poise.jobs.track.controllers import RULE
+from poise.jobs.result import RULE
 from poise.kinematics import lowest_height
 from poise.metrics import success_rule
 from poise.papers.compliant.figures import FALLEN, TOUCHES_N
-from poise.papers.compliant.opponents import Opposing
+from poise.papers.compliant.opponents import Opponent
 from poise.papers.compliant.scenes import Balance, Chicken, DoorScene, PlayScene, TrampolineScene
 from poise.papers.compliant.scenes.ball import COS_45, upright_of
-from poise.papers.compliant.scenes.body_scenes import Bouncing
+from poise.papers.compliant.scenes.body_scenes import Bounce
 from poise.papers.compliant.scenes.door import WANTED, across
 from poise.recipes.imitation import Imitation
 from poise.score.report import Mover, Shape
@@ -33,7 +32,8 @@ from poise.sim import CharacterRows, Mechanics
 
 
 class Meter(Protocol):
-    """Looks at the environments of a scene, and has figures at the end: means over the episodes."""
+    """Looks at the environments of a scene, and has figures `(E,)` of the episodes at the end; NaN where
+    an episode has none."""
 
     words: Mapping[str, str]
     """What the figures are, by their keys."""
@@ -46,8 +46,8 @@ class Meter(Protocol):
         """Control step `step` has been made; 0 is before the first one."""
         ...
 
-    def figures(self) -> dict[str, float]:
-        """What was seen."""
+    def figures(self) -> dict[str, Tensor]:
+        """Of all that was seen."""
         ...
 
 
@@ -149,25 +149,25 @@ class Watch:
             for (shape, _), way in zip(self._shapes, ways, strict=True)
         )
 
-    def figures(self, rollouts: RolloutSet, task: Imitation) -> dict[str, float]:
-        """The figures, means over the episodes."""
+    def figures(self, rollouts: RolloutSet, task: Imitation) -> dict[str, Tensor]:
+        """The figures `(E,)` of each episode."""
         s = self._sums
-        off = (rollouts.pos - rollouts.ref_pos).norm(dim=-1).mean()
+        off = (rollouts.pos - rollouts.ref_pos).norm(dim=-1).mean((1, 2))
         low = lowest_height(task.humanoid.table, rollouts.pos, rollouts.quat)
-        lost = (judge(rollouts, success_rule(RULE)).failed_at >= 0).sum()
+        lost = judge(rollouts, success_rule(RULE)).failed_at >= 0
         found = {
-            "force_mean_n": float((s["sum"] / s["acts"].clamp_min(1.0)).mean()),
-            "force_peak_n": float(s["peak"].mean()),
-            "impulse_ns": float(s["impulse"].mean()),
-            "torque_nm": float((s["torque"] / s["steps"].clamp_min(1.0)).mean()),
-            "goal_moved_m": float(s["moved"].mean()),
-            "steps": float(footfalls(low[..., list(task.humanoid.feet)]).double().mean()),
-            "off_m": float(off),
-            "lost": float(lost),
+            "force_mean_n": s["sum"] / s["acts"].clamp_min(1.0),
+            "force_peak_n": s["peak"],
+            "impulse_ns": s["impulse"],
+            "torque_nm": s["torque"] / s["steps"].clamp_min(1.0),
+            "goal_moved_m": s["moved"],
+            "steps": footfalls(low[..., list(task.humanoid.feet)]),
+            "off_m": off,
+            "lost": lost,
         }
         if self.meter is not None:
             found |= self.meter.figures()
-        return {k: round(v, 4) for k, v in found.items()}
+        return {k: v.double().cpu() for k, v in found.items()}
 
 
 def footfalls(height: Tensor) -> Tensor:
@@ -217,13 +217,13 @@ class DoorMeter:
         angle = -state.qpos[:, self._sim.scene.place("door").qpos.start].double()
         self._angle = torch.maximum(self._angle, on * angle)
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, Tensor]:
         count, wide, along = self._sums
         return {
-            "across_n": float((wide / count.clamp_min(1.0)).mean()),
-            "along_n": float((along / count.clamp_min(1.0)).mean()),
-            "angle_rad": float(self._angle.mean()),
-            "opened": float((self._angle >= WANTED).sum()),
+            "across_n": wide / count.clamp_min(1.0),
+            "along_n": along / count.clamp_min(1.0),
+            "angle_rad": self._angle,
+            "opened": self._angle >= WANTED,
         }
 
 
@@ -238,7 +238,7 @@ class TrampolineMeter:
 
     def begin(self, env: ImitationEnv) -> None:
         part = part_of(env)
-        self._bounce = next(h for h in part.events if isinstance(h, Bouncing))
+        self._bounce = next(h for h in part.events if isinstance(h, Bounce))
         self._sim, self._mechanics = part.sim, Mechanics(env.backend)
         self._feet = list(env.goal.humanoid.feet)
         n = env.num_envs
@@ -265,15 +265,15 @@ class TrampolineMeter:
         energy = kinetic + env.goal.humanoid.mass * G * (com - self._com)
         self._joules += torch.where(lands, energy, 0.0)
         self._steps += lands
-        if step / env.goal.rate_hz > self._bounce.first_s:
+        if step / env.goal.rate_hz > self._bounce.first:
             height = self._sim.backend.state.qpos[:, self._sim.scene.place("trampoline").qpos.start]
             self._plate = torch.maximum(self._plate, torch.stack((height, -height)).double())
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, Tensor]:
         return {
-            "foot_low_m": float((self._lows / self._landings.clamp_min(1.0)).mean()),
-            "plate_m": float(self._plate.sum(0).clamp_min(0.0).mean()),
-            "energy_j": float((self._joules / self._steps.clamp_min(1.0)).mean()),
+            "foot_low_m": self._lows / self._landings.clamp_min(1.0),
+            "plate_m": self._plate.sum(0).clamp_min(0.0),
+            "energy_j": self._joules / self._steps.clamp_min(1.0),
         }
 
 
@@ -282,7 +282,6 @@ class BallMeter:
 
     words: Mapping[str, str] = {
         "stays_s": "Ball stays above the head, its rod less than 45 degrees from upright, mean, s",
-        "stays_least_s": "The same, the shortest episode, s",
         "tilt_deg": "Tilt of the rod while the ball stays, mean, degrees",
     }
 
@@ -299,12 +298,11 @@ class BallMeter:
         self._sums += self._up * torch.stack((torch.ones_like(tilt), tilt))
         self._rate = env.goal.rate_hz
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, Tensor]:
         stays, tilt = self._sums
         return {
-            "stays_s": float(stays.mean() / self._rate),
-            "stays_least_s": float(stays.amin() / self._rate),
-            "tilt_deg": math.degrees(float((tilt / stays.clamp_min(1.0)).mean())),
+            "stays_s": stays / self._rate,
+            "tilt_deg": (tilt / stays.clamp_min(1.0)).rad2deg(),
         }
 
 
@@ -320,7 +318,7 @@ class ChickenMeter:
 
     def begin(self, env: ImitationEnv) -> None:
         self._part = part_of(env)
-        opposing = env.event(Opposing)
+        opposing = env.event(Opponent)
         self._envs = [env] if opposing is None else [env, opposing.env]
         n = env.num_envs
         self._left = torch.full((n,), -1, dtype=torch.long)
@@ -345,15 +343,10 @@ class ChickenMeter:
                 self._stood = height.clone()
             self._fell |= height < FALLEN * self._stood
 
-    def figures(self) -> dict[str, float]:
-        counts = self._left == 0
-        ways = self._way[:, counts].mean(1) if bool(counts.any()) else self._way[:, 0] * 0.0
-        return {
-            "pushed_mm": 1000.0 * float(ways[0]),
-            "rival_pushed_mm": 1000.0 * float(ways[1]) if len(ways) > 1 else 0.0,
-            "touched": float((self._left >= 0).sum()),
-            "rival_fell": float(self._fell.sum()),
-        }
+    def figures(self) -> dict[str, Tensor]:
+        way = 1000.0 * self._way.where(self._left == 0, torch.nan)
+        found = {"pushed_mm": way[0], "touched": self._left >= 0}
+        return found if len(way) == 1 else {**found, "rival_pushed_mm": way[1], "rival_fell": self._fell}
 
 
 def _off(env: ImitationEnv) -> Tensor:

@@ -28,8 +28,8 @@ from typing import Any, Literal
 from poise.errors import PoiseError
 from poise.learn import PPOConfig
 from poise.recipes.imitation import Clips, Imitation
-from poise.recipes.residual_force import ResidualForce
 from poise.recipes.residual_force import build as imitation_of
+from poise.recipes.residual_force_settings import ResidualForce
 
 #: Eq. 9: S_init in N and N m, what is left of it at i_end, and both iterations of 1,500.
 INITIAL, LEFT, FALLS, ITERATIONS = 220.0, 100.0, (100, 1300), 1500

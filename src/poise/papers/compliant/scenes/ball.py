@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import mujoco
 import torch
@@ -14,16 +14,17 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import EpisodeStart, Event, Felt, Force
+from poise.env.events import EpisodeStart, Felt, Force, StatedEvent
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
 from poise.env.pushes import Pushes
 from poise.env.reference import Reference
-from poise.env.scene import InScene, RandomEvent, Switch, near
+from poise.env.scene_events import InScene, RandomEvent, Switch, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
-from poise.papers.compliant.scenes.stage import Given, SceneSetup
+from poise.papers.compliant.scenes.stage import LINKED, Given, SceneSetup
+from poise.score import Spread
 from poise.settings import Checked, Positive, Range, validate
 from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
 from poise.sim.props import Vector, solid
@@ -94,6 +95,9 @@ class Balance:
         seed: of the draws.
     """
 
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = LINKED
+
     length: Annotated[float, Range(0.1, 5, unit="m")] = 1.0
     spread: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.02
     gain: float = GAIN
@@ -139,7 +143,7 @@ class Balance:
         pushes = (push,) if self.pushes else ()
         known = {"head": head, "length": self.length}
         return SceneSetup(
-            (top,), (link,), (), (part, *pushes, Fictional(self, head)),
+            (top,), (link,), (), (part, *pushes, FictionalForces(self, head)),
             (ObsTerm("task/ball", ball_seen, known),),
             (RewardTerm("task/above", above, 0.5, known, imitation=False),),
             (DoneTerm("task/dropped", dropped),), True, yields=fictional,
@@ -153,8 +157,8 @@ def fictional(given: Given | None) -> Given:
     return given or Stiffness(1000.0, 0.02, series=False)
 
 
-@dataclass(frozen=True)
-class Tilted:
+@dataclass
+class Tilted(RandomEvent):
     """A rod that begins each episode upright but for a random tilt about X and Y.
 
     Attributes:
@@ -167,65 +171,49 @@ class Tilted:
     spread: float
     seed: int
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> _Tilted:
-        """The event in the worlds of a scene."""
-        return _Tilted(self, sim)
-
-
-class _Tilted(RandomEvent):
-    def __init__(self, event: Tilted, sim: SceneSim):
-        super().__init__(event.seed)
-        self._event, self._sim = event, sim
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        super().enter(sim, control_hz)
+        self._sim = sim
 
     def begin(self, episodes: EpisodeStart) -> None:
         worlds = episodes.worlds
-        half = 0.5 * self.between(-self._event.spread, self._event.spread, len(worlds), 2)
+        half = 0.5 * self.between(-self.spread, self.spread, len(worlds), 2)
         qpos = torch.zeros(len(worlds), 7, dtype=torch.float64)
-        qpos[:, :3], qpos[:, 3] = torch.tensor(self._event.rod.pos), 1.0
+        qpos[:, :3], qpos[:, 3] = torch.tensor(self.rod.pos), 1.0
         qpos[:, 4:6] = half
         qpos[:, 3:] /= qpos[:, 3:].norm(dim=1, keepdim=True)
         here = self._sim.backend.device
         still = torch.zeros(len(worlds), 6, dtype=torch.float64, device=here)
-        self._sim.place(self._event.rod.name, qpos.to(here), still, worlds)
+        self._sim.place(self.rod.name, qpos.to(here), still, worlds)
 
 
-@dataclass(frozen=True)
-class Fictional:
+@dataclass
+class FictionalForces(StatedEvent[Goal, Backend], Force):
     """The fictional forces of `Balance`, as an event.
 
+    At work it has `asked` `(N, 6)`: the forces that a policy asks for in the control steps that come,
+    at head and root, in units of `UNIT_N` and the heading's axes, beside the linear law; None for none.
+
     Attributes:
-        given: the scene.
+        law: the scene.
         head: the body's row.
     """
 
-    given: Balance
+    law: Balance
     head: int
 
-    def __call__(self, goal: Goal, backend: Backend) -> Event:
-        """The event of an environment."""
+    def enter(self, goal: Goal, backend: Backend) -> None:
         if not isinstance(backend, CharacterRows) or backend.sim is None:
             raise PoiseError("'ball' needs the worlds of its scene", "ball", code="scene-needed")
-        return FictionalForces(self, backend, backend.sim, goal)
-
-
-class FictionalForces(Force):
-    """The fictional forces in N worlds.
-
-    Attributes:
-        asked: `(N, 6)` what a policy asks for in the control steps that come, at head and root, in units
-            of `UNIT_N` and the heading's axes, beside the linear law; None for nothing.
-    """
-
-    def __init__(self, given: Fictional, rows: CharacterRows, sim: SceneSim, goal: Goal):
         self.asked: Tensor | None = None
-        self._given, self._rows, self._sim, self._goal = given, rows, sim, goal
-        like = rows.state.xpos
-        self._body = torch.tensor([given.head + 1, 1], device=like.device).repeat(rows.num_envs, 1)
-        self._force = like.new_zeros(rows.num_envs, 2, 3)
+        self._rows, self._sim, self._goal = backend, backend.sim, goal
+        like, n = backend.state.xpos, backend.num_envs
+        self._body = torch.tensor([self.head + 1, 1], device=like.device).repeat(n, 1)
+        self._force = like.new_zeros(n, 2, 3)
 
     def before_step(self, drive: Drive) -> bool:
         """A control step begins: sets the forces that are held for it."""
-        law = self._given.given
+        law = self.law
         off, moves = tipped(self._sim, law.length)
         off = off - self._head()
         # A ball that has fallen is let go.
@@ -243,7 +231,7 @@ class FictionalForces(Force):
     def _head(self) -> Tensor:
         """`(N, 3)` where the head would be without giving way, m."""
         goal = self._goal.goal if isinstance(self._goal, DisplacedGoal) else self._goal
-        return goal.layout.unpacked(goal.now()).pos[:, self._given.head]
+        return goal.layout.unpacked(goal.now()).pos[:, self.head]
 
     def felt(self) -> Felt:
         point = self._rows.state.xpos.gather(1, self._body.unsqueeze(-1).expand(-1, -1, 3))

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -16,12 +16,31 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.env.events import EpisodeStart, Event
+from poise.env.events import EpisodeStart
 from poise.env.pushes import Push
 from poise.env.reference import Reference
-from poise.env.scene import InScene, Move, ScenePart, SetDown, Switch, Throw, always, touches_of
+from poise.env.scene_events import (
+    InScene,
+    Move,
+    SceneEvent,
+    ScenePart,
+    SetDown,
+    Switch,
+    Throw,
+    always,
+    touches_of,
+)
 from poise.errors import PoiseError
-from poise.papers.compliant.scenes.stage import Given, SceneSetup, as_given, hand_of
+from poise.papers.compliant.scenes.stage import (
+    CONTACTS_HZ,
+    LINKED,
+    STARTS,
+    Given,
+    SceneSetup,
+    as_given,
+    hand_of,
+)
+from poise.score import Spread
 from poise.settings import Checked, Positive, Range, validate
 from poise.sim import Drive, Link, Plane, SceneSim, Touch
 from poise.sim.props import Ball, Box, Carrier, Vector, solid
@@ -40,6 +59,9 @@ class HandInHand:
         sway: m, to either side.
         every_s: s, the time of a swing.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = LINKED
 
     side: Literal["left", "right"] = "left"
     lead: Annotated[float, Range(-10, 10, above=True, below=True, unit="m/s")] = 0.0
@@ -103,6 +125,9 @@ class Chicken:
         seed: of the draws.
     """
 
+    rate_hz: ClassVar[float | None] = CONTACTS_HZ
+    starts: ClassVar[Spread] = STARTS
+
     mass: Annotated[float, Range(2, 500, unit="kg")] = HEAVY_KG
     other: Annotated[float, Range(2, 500, unit="kg")] = LIGHT_KG
     against: Literal["bag", "rival"] = "bag"
@@ -117,15 +142,17 @@ class Chicken:
         name = "bag" if self.against == "bag" else RIVAL
         touches = touches_of("felt", name, humanoid.bodies)
         felt = tuple(t.name for t in touches)
+        hit = Touch("hit", name, "character")
+        touches = (*touches, hit)
         if self.against == "rival":
-            return SceneSetup((), (), touches, (InScene(felt=felt),), from_start=True)
+            part = InScene(metered=(hit.name,), felt=felt)
+            return SceneSetup((), (), touches, (part,), from_start=True)
         chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
         bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other)
-        return SceneSetup(
-            (bag,), (), touches, (InScene(felt=felt, events=(far, throw)),), from_start=True
-        )
+        part = InScene(metered=(hit.name,), felt=felt, events=(far, throw))
+        return SceneSetup((bag,), (), touches, (part,), from_start=True)
 
 
 def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
@@ -155,6 +182,9 @@ class PullScene:
         start_s: s, when it begins.
         lasts_s: s, for how long.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = STARTS
 
     newtons: Annotated[float, Range(0, 1e4, above=True, below=True, unit="N")] = 20.0
     side: Literal["left", "right"] = "left"
@@ -187,6 +217,9 @@ class Throws:
         every_s: s between throws, drawn between.
         seed: of the draws.
     """
+
+    rate_hz: ClassVar[float | None] = CONTACTS_HZ
+    starts: ClassVar[Spread] = STARTS
 
     mass: Annotated[float, Range(0, 100, above=True, below=True, unit="kg")] = 1.0
     speed: Annotated[tuple[float, float], Range(0, above=True, rising=True, unit="m/s")] = (2.0, 3.0)
@@ -284,6 +317,9 @@ class TrampolineScene:
         first: s, when the first bounce begins.
     """
 
+    rate_hz: ClassVar[float | None] = CONTACTS_HZ
+    starts: ClassVar[Spread] = STARTS
+
     height: Annotated[float, Range(0, 1, unit="m")] = 0.15
     first: Annotated[float, Range(0, EVERY_S, below=True, unit="s")] = 1.0
 
@@ -315,13 +351,16 @@ def stands_still(given: Given | None) -> Given:
 
 def after_contact(part: ScenePart, force: Tensor) -> Tensor:
     """A force where the character gives way just now, else 0."""
-    bounce = next(h for h in part.events if isinstance(h, Bouncing))
+    bounce = next(h for h in part.events if isinstance(h, Bounce))
     return force * (bounce.gives > 0).to(force).unsqueeze(1)
 
 
-@dataclass(frozen=True)
-class Bounce:
+@dataclass
+class Bounce(SceneEvent):
     """A plate's actuators rise for a moment, every 3 s.
+
+    At work it counts, each `(N,)`, `steps`, control steps since the episode began, and `gives`, those
+    for which the character gives way yet; `air` is 1 where the feet have left the plate.
 
     Attributes:
         plate: its name.
@@ -335,25 +374,9 @@ class Bounce:
     touches: tuple[str, ...]
     first: float = 1.0
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return Bouncing(self, sim, control_hz)
-
-
-class Bouncing(Event):
-    """`Bounce` in N worlds.
-
-    Attributes:
-        steps: `(N,)` control steps since the episode began.
-        air: `(N,)` whether the feet have left the plate since the last bounce began.
-        gives: `(N,)` control steps for which the character gives way yet.
-        first_s: s, when the first bounce begins.
-    """
-
-    def __init__(self, event: Bounce, sim: SceneSim, control_hz: float):
-        self.first_s = event.first
-        self._event, self._sim, self._hz = event, sim, control_hz
-        self._controls = sim.scene.place(event.plate).controls
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        self._sim, self._hz = sim, control_hz
+        self._controls = sim.scene.place(self.plate).controls
         here = sim.backend.device
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=here)
         self.gives, self.air = torch.zeros_like(self.steps), torch.zeros_like(self.steps)
@@ -367,15 +390,15 @@ class Bouncing(Event):
             value[worlds] = 0
 
     def before_step(self, drive: Drive) -> bool:
-        since = self.steps / self._hz - self._event.first
+        since = self.steps / self._hz - self.first
         up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
         ctrl = self._sim.backend.drive.ctrl
-        ctrl[:, self._controls] = self._event.height * up.to(ctrl).unsqueeze(1)
+        ctrl[:, self._controls] = self.height * up.to(ctrl).unsqueeze(1)
         return False
 
     def after_step(self) -> None:
         self.steps += 1
-        force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self._event.touches)
+        force = sum(self._sim.touch(name).force.norm(dim=-1) for name in self.touches)
         stands = torch.as_tensor(force) > CONTACT_N
         down = stands & (self.air > 0)
         self.gives = torch.where(down, round(GIVES_S * self._hz), (self.gives - 1).clamp_min(0))

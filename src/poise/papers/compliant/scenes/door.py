@@ -5,19 +5,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.events import EpisodeStart, Event
+from poise.env.events import EpisodeStart
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
-from poise.env.scene import InScene, ScenePart, SetDown
+from poise.env.scene_events import InScene, SceneEvent, ScenePart, SetDown
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
-from poise.papers.compliant.scenes.stage import SceneSetup, hand_of
+from poise.papers.compliant.scenes.stage import STARTS, SceneSetup, hand_of
+from poise.score import Spread
 from poise.settings import Range, validate
 from poise.sim import Drive, Link, SceneSim
 from poise.sim.props import Door
@@ -50,6 +51,9 @@ class DoorScene:
         made_for: m, how wide the door is for which the motion is made; None: this one. The paper has its
             character learn at 1 m and try up to 1.7.
     """
+
+    rate_hz: ClassVar[float | None] = None
+    starts: ClassVar[Spread] = STARTS
 
     width: Annotated[float, Range(0, 10, above=True, below=True, unit="m")] = 1.0
     weight: Annotated[float, Range(0, 1000, above=True, below=True, unit="kg")] = 20.0
@@ -156,8 +160,8 @@ def opened(frame: Frame) -> Tensor:
     return torch.exp(-SHARPNESS * (WANTED - angle(frame)).clamp_min(0.0))
 
 
-@dataclass(frozen=True)
-class Grip:
+@dataclass
+class Grip(SceneEvent):
     """The weld of a hand and a door's knob: on while the motion has it there and the hand is near.
 
     Attributes:
@@ -168,16 +172,10 @@ class Grip:
     hand: str
     door: Door
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return _Grip(self, sim, control_hz)
-
-
-class _Grip(Event):
-    def __init__(self, event: Grip, sim: SceneSim, control_hz: float):
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
         self._sim, self._hz = sim, control_hz
-        self._hand, self._knob = sim.scene.model.body(event.hand).id, torch.tensor(event.door.knob)
-        self._leaf = sim.scene.place(event.door.name).body
+        self._hand, self._knob = sim.scene.model.body(self.hand).id, torch.tensor(self.door.knob)
+        self._leaf = sim.scene.place(self.door.name).body
         self._row = [link.name for link in sim.scene.scene.links].index("grip")
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=sim.backend.device)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
@@ -12,6 +13,7 @@ from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
 from poise.env.goal import Goal
 from poise.env.reference import Reference
 from poise.errors import PoiseError
+from poise.score import Spread
 from poise.sim import Backend, Character, Floor, Link, Plane, Touch
 from poise.sim.props import Prop
 
@@ -47,8 +49,21 @@ class SceneSetup(NamedTuple):
     yields: Callable[[Given | None], Given] = as_given
 
 
+#: Starts of episodes: the paper states none.
+STARTS = Spread(0.02, 0.05, 0.1, 0.1, math.radians(10.0))
+#: Starts in which something is linked to a hand or stands on the head from the first moment on.
+LINKED = Spread(0.02, 0.0, 0.1, 0.1)
+#: Hz, of scenes in which bodies meet (Sec. 5.2).
+CONTACTS_HZ = 600.0
+
+
 class PlayScene(Protocol):
     """The settings of a scene, one file each."""
+
+    rate_hz: ClassVar[float | None]
+    """Hz, of its physics; None is the policy's own."""
+    starts: ClassVar[Spread]
+    """How far its episodes begin from the motion's first frame."""
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """What it takes for a body and the motion that it follows.

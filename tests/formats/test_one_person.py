@@ -11,7 +11,7 @@ from handmade_numpy_files import aist, amass, save_npz, save_pickle
 from handmade_people import NAMES, csv, trc, walk
 
 from poise.formats import read_clip
-from poise.formats.people import person_of
+from poise.formats.one_person import person_of
 from poise.formats.point_arrays import HUMANML3D
 from poise.formats.point_raw import without_zeros
 from poise.motion import Clip

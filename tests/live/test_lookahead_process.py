@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 
 from poise.jobs.open import open_run
-from poise.live.lookahead import LEAD, QUICK, AheadBeside, tries_of
+from poise.live.lookahead_process import LEAD, QUICK, AheadBeside, tries_of
 from poise.live.world import LiveWorld
 from refusals import refused
 

@@ -174,7 +174,7 @@ KILLER = """
 import os, random, signal, sys, tempfile, time, torch
 torch.set_num_threads(1)
 from pathlib import Path
-from test_train import LATEST, Until, load_checkpoint, make, run
+from test_trainer import LATEST, Until, load_checkpoint, make, run
 folder, rng, resumed = Path(sys.argv[1]), random.Random(int(sys.argv[2])), set()
 run(make(), Until(iterations=3), tempfile.mkdtemp())
 start = time.perf_counter()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.stream import BufferedGoal
+from poise.env.stream_goal import BufferedGoal
 from poise.errors import PoiseError
 from poise.settings import Checked, Range
 

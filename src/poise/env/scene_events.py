@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from poise.env.events import EpisodeStart, Event, Felt, Force, StepOutcome
+from poise.env.events import EpisodeStart, Event, Felt, Force, StatedEvent, StepOutcome
 from poise.env.goal import Goal
 from poise.errors import PoiseError, did_you_mean
 from poise.settings import Checked, Positive, Range
@@ -21,16 +21,20 @@ from poise.sim import Backend, CharacterRows, Drive, SceneSim, Touch
 Condition = Callable[[SceneSim], Tensor]
 
 
-#: Makes an event in the N worlds of a scene, at so many control steps a second; a PoiseError for what is
-#: not in it. What episodes of all characters begin in are worlds, see `EpisodeStart.ids`.
-MakesEvent = Callable[[SceneSim, float], Event]
+class SceneEvent(StatedEvent[SceneSim, float], Event):
+    """Base of `InScene.events`; `enter` gets the worlds of a scene, and its control steps a second.
+
+    Episodes of all characters begin in worlds, see `EpisodeStart.worlds`.
+    """
 
 
-class RandomEvent(Event):
+class RandomEvent(SceneEvent):
     """An event with a generator of its own."""
 
-    def __init__(self, seed: int):
-        self.rng = torch.Generator().manual_seed(seed)
+    seed: int
+
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        self.rng = torch.Generator().manual_seed(self.seed)
 
     def between(self, low: float, high: float, *shape: int) -> Tensor:
         """Numbers drawn evenly, float64 on the CPU."""
@@ -83,7 +87,7 @@ def ends_on(sim: SceneSim, rows: CharacterRows, name: str) -> list[End]:
     for body, sign in _ends(sim, name, touch):
         for k, place in enumerate(rows.places):
             if touch is not None and body == place.name:
-                hint = "Touch its bodies one by one, see poise.env.scene.touches_of"
+                hint = "Touch its bodies one by one, see poise.env.scene_events.touches_of"
                 raise PoiseError(
                     f"touch '{name}' does not say which body is touched",
                     "InScene",
@@ -155,7 +159,7 @@ class InScene:
     metered: tuple[str, ...] = ()
     felt: tuple[str, ...] = ()
     felt_part: Mapping[str, Callable[[ScenePart, Tensor], Tensor]] = field(default_factory=dict)
-    events: tuple[MakesEvent, ...] = ()
+    events: tuple[SceneEvent, ...] = ()
     ends: Literal["character", "world"] = "character"
 
     def __call__(self, goal: Goal, backend: Backend) -> ScenePart:
@@ -327,8 +331,8 @@ def cut_off(terminated: Tensor, truncated: Tensor, many: int) -> None:
 G = 9.81
 
 
-@dataclass(frozen=True)
-class SetDown:
+@dataclass
+class SetDown(RandomEvent):
     """A thing that begins each episode where it is told, with other links and things as they are.
 
     Attributes:
@@ -346,44 +350,39 @@ class SetDown:
     spread: float = 0.0
     seed: int = 0
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return _SetDown(self, sim)
-
-
-class _SetDown(RandomEvent):
-    def __init__(self, event: SetDown, sim: SceneSim):
-        super().__init__(event.seed)
-        place = sim.scene.place(event.name)
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        super().enter(sim, control_hz)
+        place = sim.scene.place(self.name)
         dofs = place.dofs.stop - place.dofs.start
-        if len(event.qpos) != place.coordinates or len(event.qvel) not in (0, dofs):
+        if len(self.qpos) != place.coordinates or len(self.qvel) not in (0, dofs):
             raise PoiseError(
-                f"'{event.name}' has {place.coordinates} coordinates and {dofs} velocities, got "
-                f"{len(event.qpos)} and {len(event.qvel)}",
+                f"'{self.name}' has {place.coordinates} coordinates and {dofs} velocities, got "
+                f"{len(self.qpos)} and {len(self.qvel)}",
                 "SetDown",
                 code="count-differs",
             )
-        self._event, self._sim = event, sim
-        self._qpos = torch.tensor(event.qpos, dtype=torch.float64)
-        self._qvel = torch.tensor(event.qvel or (0.0,) * dofs, dtype=torch.float64)
+        self._sim = sim
+        self._qpos = torch.tensor(self.qpos, dtype=torch.float64)
+        self._qvel = torch.tensor(self.qvel or (0.0,) * dofs, dtype=torch.float64)
         # A free body's quaternion is left as it is.
         self._moved = 3 if place.coordinates == 7 and dofs == 6 else place.coordinates
 
     def begin(self, episodes: EpisodeStart) -> None:
         worlds = episodes.worlds
-        n, spread = len(worlds), self._event.spread
+        n, spread = len(worlds), self.spread
         qpos = self._qpos.repeat(n, 1)
         if spread:
             qpos[:, : self._moved] += self.between(-spread, spread, n, self._moved)
         here = self._sim.backend.device
-        self._sim.place(self._event.name, qpos.to(here), self._qvel.repeat(n, 1).to(here), worlds)
+        self._sim.place(self.name, qpos.to(here), self._qvel.repeat(n, 1).to(here), worlds)
 
 
-@dataclass(frozen=True)
-class Throw(Checked):
+@dataclass
+class Throw(RandomEvent, Checked):
     """A free body that is thrown at another one from all around, again and again.
 
-    It flies so that it would hit the body's centre if that kept its velocity.
+    It flies so that it would hit the body's centre if that kept its velocity. At work it counts `left`
+    `(N,)`, control steps until the next throw, and `thrown` `(N,)`, throws of each episode.
 
     Attributes:
         name: of the free body.
@@ -403,29 +402,23 @@ class Throw(Checked):
     height: tuple[float, float] = (-0.2, 0.2)
     seed: int = 0
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return _Throw(self, sim, control_hz)
-
-
-class _Throw(RandomEvent):
-    def __init__(self, event: Throw, sim: SceneSim, control_hz: float):
-        super().__init__(event.seed)
-        if sim.scene.place(event.name).coordinates != 7:
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        super().enter(sim, control_hz)
+        if sim.scene.place(self.name).coordinates != 7:
             raise PoiseError(
-                f"'{event.name}' is not free to fly",
+                f"'{self.name}' is not free to fly",
                 "Throw",
                 "Throw a Ball or a Box",
                 code="not-free-to-fly",
             )
         names = [sim.scene.model.body(i).name for i in range(sim.scene.model.nbody)]
-        if event.at not in names:
-            hint = did_you_mean(event.at, names)
+        if self.at not in names:
+            hint = did_you_mean(self.at, names)
             raise PoiseError(
-                f"there is no body '{event.at}' in the scene", "Throw", hint, code="unknown-body"
+                f"there is no body '{self.at}' in the scene", "Throw", hint, code="unknown-body"
             )
-        self._event, self._sim, self._hz = event, sim, control_hz
-        self._body = names.index(event.at)
+        self._sim, self._hz = sim, control_hz
+        self._body = names.index(self.at)
         self.left = torch.zeros(sim.num_envs, dtype=torch.long, device=sim.backend.device)
         self.thrown = torch.zeros_like(self.left)
         self._draw(torch.arange(sim.num_envs))
@@ -437,7 +430,7 @@ class _Throw(RandomEvent):
         self._draw(episodes.worlds)
 
     def _draw(self, worlds: Tensor) -> None:
-        wait = self.between(*self._event.every_s, len(worlds)) * self._hz
+        wait = self.between(*self.every_s, len(worlds)) * self._hz
         self.left[worlds] = wait.round().long().clamp_min(1).to(self.left.device)
         self.thrown[worlds] = 0
 
@@ -446,33 +439,33 @@ class _Throw(RandomEvent):
         now = (self.left <= 0).nonzero().squeeze(-1)
         if not len(now):
             return False
-        event, state, n = self._event, self._sim.backend.state, len(now)
+        state, n = self._sim.backend.state, len(now)
         angle, speed, up = (
             self.between(low, high, n).to(state.qpos)
-            for low, high in ((0.0, 2.0 * torch.pi), event.speed, event.height)
+            for low, high in ((0.0, 2.0 * torch.pi), self.speed, self.height)
         )
         target = state.xipos[now, self._body].to(state.qpos)
         arm = target - state.subtree_com[now, int(self._sim.scene.model.body_rootid[self._body])]
         spin, moves = state.cvel[now, self._body].split(3, -1)
         moves = moves + torch.linalg.cross(spin, arm)
         around = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)
-        start = target + event.distance * around
+        start = target + self.distance * around
         start[:, 2] = (start[:, 2] + up).clamp_min(0.1)
-        time = (event.distance / speed).unsqueeze(-1)
+        time = (self.distance / speed).unsqueeze(-1)
         velocity = (target - start) / time + moves
         velocity[:, 2:] += 0.5 * G * time
         turn = torch.zeros(n, 4).to(start)
         turn[:, 0] = 1.0
         qvel = torch.cat((velocity, torch.zeros_like(velocity)), -1)
-        self._sim.place(event.name, torch.cat((start, turn), -1), qvel, now)
+        self._sim.place(self.name, torch.cat((start, turn), -1), qvel, now)
         seen = self.thrown[now] + 1
         self._draw(now)
         self.thrown[now] = seen
         return False
 
 
-@dataclass(frozen=True)
-class Switch:
+@dataclass
+class Switch(SceneEvent):
     """A link that is switched on where a condition becomes true, and off where another one does.
 
     Attributes:
@@ -485,31 +478,24 @@ class Switch:
     on: Condition
     off: Condition | None = None
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return _Switch(self, sim)
-
-
-class _Switch(Event):
-    def __init__(self, event: Switch, sim: SceneSim):
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
         names = [link.name for link in sim.scene.scene.links]
-        if event.link not in names:
-            hint = did_you_mean(event.link, names)
-            raise PoiseError(f"there is no link '{event.link}'", "Switch", hint, code="unknown-link")
-        self._event, self._sim, self._row = event, sim, names.index(event.link)
+        if self.link not in names:
+            hint = did_you_mean(self.link, names)
+            raise PoiseError(f"there is no link '{self.link}'", "Switch", hint, code="unknown-link")
+        self._sim, self._row = sim, names.index(self.link)
 
     def begin(self, episodes: EpisodeStart) -> None:
         worlds = episodes.worlds
         begins_on = self._sim.scene.scene.links[self._row].on
-        self._sim.switch(self._event.link, begins_on, worlds)
+        self._sim.switch(self.link, begins_on, worlds)
 
     def before_step(self, drive: Drive) -> bool:
         active = self._sim.backend.state["eq_active"][:, self._row].bool()
-        off = self._event.off
-        if off is not None and len(rows := (active & off(self._sim)).nonzero().squeeze(-1)):
-            self._sim.switch(self._event.link, False, rows)
-        if len(rows := (~active & self._event.on(self._sim)).nonzero().squeeze(-1)):
-            self._sim.switch(self._event.link, True, rows)
+        if self.off is not None and len(rows := (active & self.off(self._sim)).nonzero().squeeze(-1)):
+            self._sim.switch(self.link, False, rows)
+        if len(rows := (~active & self.on(self._sim)).nonzero().squeeze(-1)):
+            self._sim.switch(self.link, True, rows)
         return False
 
 
@@ -529,9 +515,11 @@ def always(sim: SceneSim) -> Tensor:
     return torch.ones(sim.num_envs, dtype=torch.bool, device=sim.backend.device)
 
 
-@dataclass(frozen=True)
-class Move:
+@dataclass
+class Move(SceneEvent):
     """A thing that goes a way of its own: it is set to it at every control step, velocity and all.
+
+    At work it counts `steps` `(N,)`, the control steps of each episode.
 
     Attributes:
         name: of the thing, such as a `Carrier`.
@@ -542,15 +530,9 @@ class Move:
     name: str
     path: Callable[[Tensor], tuple[Tensor, Tensor]]
 
-    def __call__(self, sim: SceneSim, control_hz: float) -> Event:
-        """The event in the worlds of a scene."""
-        return _Move(self, sim, control_hz)
-
-
-class _Move(Event):
-    def __init__(self, event: Move, sim: SceneSim, control_hz: float):
-        self._event, self._sim, self._hz = event, sim, control_hz
-        self._place = sim.scene.place(event.name)
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        self._sim, self._hz = sim, control_hz
+        self._place = sim.scene.place(self.name)
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=sim.backend.device)
         self._set()
 
@@ -560,8 +542,8 @@ class _Move(Event):
     def begin(self, episodes: EpisodeStart) -> None:
         worlds = episodes.worlds
         self.steps[worlds] = 0
-        qpos, qvel = self._event.path(self.steps / self._hz)
-        self._sim.place(self._event.name, qpos[worlds], qvel[worlds], worlds)
+        qpos, qvel = self.path(self.steps / self._hz)
+        self._sim.place(self.name, qpos[worlds], qvel[worlds], worlds)
 
     def before_step(self, drive: Drive) -> bool:
         self._set()
@@ -569,7 +551,7 @@ class _Move(Event):
 
     def _set(self) -> None:
         # What follows from the state is computed by the step that comes.
-        state, (qpos, qvel) = self._sim.backend.state, self._event.path(self.steps / self._hz)
+        state, (qpos, qvel) = self._sim.backend.state, self.path(self.steps / self._hz)
         state.qpos[:, self._place.qpos] = qpos.to(state.qpos)
         state.qvel[:, self._place.dofs] = qvel.to(state.qvel)
 

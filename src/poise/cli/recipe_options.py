@@ -10,12 +10,22 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import field, fields, make_dataclass
+from dataclasses import field, fields, is_dataclass, make_dataclass
 from pathlib import Path
 from types import NoneType, SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from poise.errors import PoiseError, did_you_mean
 from poise.settings import imported
@@ -104,17 +114,41 @@ def given(*groups: Any) -> dict[str, Any]:
     return {f.name: value for f, value in pairs if value != f.default}
 
 
+#: Units that the name of a setting ends with and that of its option leaves out.
+_UNITS = re.compile(r"_(s|hz|kg|m|n)$")
+
+
 @contextmanager
-def named_options(kind: str) -> Generator[None]:
-    """Errors of settings of this kind name the option in place of the setting."""
+def named_options(options: Callable[..., Any], argv: Sequence[str]) -> Generator[None]:
+    """An error of a setting that the command line states by an option of its own names that option.
+
+    options: of a verb; each is called as the setting that it states, but for the unit. argv: what is
+    stated; a value of a file or a default keeps the name of its setting.
+    """
     try:
         yield
     except PoiseError as e:
-        name, _, rest = e.what.partition(" ")
-        if e.where != kind or not rest.startswith("must"):
+        setting, _, rest = e.what.partition(" ")
+        name, flags = setting.rpartition(".")[2], flags_of(options)
+        flag = flags.get(name) or flags.get(_UNITS.sub("", name))
+        stated = {word.partition("=")[0].replace("_", "-") for word in argv}
+        in_file = e.where is not None and Path(e.where).is_file()
+        if flag not in stated or in_file or not rest.startswith(("must ", "cannot be ")):
             raise
-        what = f"--{name.replace('_', '-')} {rest}"
-        raise PoiseError(what, hint=e.hint, code=e.code) from None
+        raise PoiseError(f"{flag} {rest}", hint=e.hint, code=e.code) from None
+
+
+def flags_of(options: Callable[..., Any]) -> dict[str, str]:
+    """The options of a verb and of its groups, "--from", by what they are called in Python."""
+    out: dict[str, str] = {}
+    for name, hint in get_type_hints(options, include_extras=True).items():
+        kind, marks = getattr(hint, "__origin__", hint), getattr(hint, "__metadata__", ())
+        if is_dataclass(kind):
+            out |= flags_of(cast("Callable[..., Any]", kind))
+        else:
+            named = next((n for m in marks if (n := getattr(m, "name", None))), None)
+            out[name] = f"--{(named or name).replace('_', '-')}"
+    return out
 
 
 def stated(texts: tuple[str, ...], kind: type) -> tuple[dict[str, Any], list[str]]:

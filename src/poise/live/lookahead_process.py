@@ -19,7 +19,7 @@ from torch import Tensor
 from poise.control import Compliance
 from poise.env import ImitationEnv
 from poise.env.env import Snapshot
-from poise.env.stream import StreamGoal
+from poise.env.stream_goal import StreamGoal
 from poise.errors import PoiseError
 from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
