@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
-from poise.live.guard import ALL, BURST, DEPTH, EACH, MOST_BYTES, Bucket, Guard, _shallow, parse
+from poise.live.admission import ALL, BURST, DEPTH, EACH, MOST_BYTES, Bucket, Guard, _shallow, parse
 from poise.live.protocol import command, turned
 from poise.live.sources import JsonStream
 from poise.live.stream import PEOPLE, WAIT, Inbox

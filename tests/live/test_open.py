@@ -22,12 +22,12 @@ from websockets.sync.client import connect
 
 from poise.cli.parse import options_of
 from poise.formats import read_clip
-from poise.live.guard import Guard
+from poise.live.admission import Guard
 from poise.live.open.actions import ACTIONS, EXPORTS, reading_of, reading_words, words_of
 from poise.live.open.answers import sentences
 from poise.live.open.look import figure_of, judged
+from poise.live.open.open_server import PAGES, OpenServer, Runs
 from poise.live.open.project import LARGEST, Project, safe_file
-from poise.live.open.server import PAGES, OpenServer, Runs
 from refusals import refused
 from test_docs import WALK
 

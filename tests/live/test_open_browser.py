@@ -16,9 +16,9 @@ from chromium import CHROMIUM, Page, opened
 
 from poise.cli.open import PRELOAD, look, rests, work
 from poise.formats import read_clip, write_clip
-from poise.live.guard import Guard
+from poise.live.admission import Guard
+from poise.live.open.open_server import OpenServer, Runs
 from poise.live.open.project import Project
-from poise.live.open.server import OpenServer, Runs
 from test_docs import WALK
 
 pytestmark = [

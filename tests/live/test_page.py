@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live.guard import A_SECOND, EACH, MOST_BYTES, Guard
+from poise.live.admission import A_SECOND, EACH, MOST_BYTES, Guard
 from poise.live.page.server import PAGES, PageServer
 from poise.live.protocol import HEAD, LiveConfig, as_json, packed
 from poise.live.session import Session, SessionConfig

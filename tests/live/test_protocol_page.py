@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from poise.live.guard import parse
+from poise.live.admission import parse
 from poise.live.protocol import COMMANDS, as_json, command
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox

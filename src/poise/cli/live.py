@@ -79,7 +79,7 @@ def run(
         )
     from poise.jobs.open import open_run
     from poise.kinematics.travel import find_travel, travelled
-    from poise.live.guard import LOOPBACK
+    from poise.live.admission import LOOPBACK
     from poise.live.protocol import LiveConfig
     from poise.live.session import Session, SessionConfig
 

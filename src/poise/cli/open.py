@@ -63,9 +63,9 @@ def run(
     """
     check_range("port", port, 0, 65_535)
     check_range("seconds", seconds, 0.1)
-    from poise.live.guard import LOOPBACK, Guard
+    from poise.live.admission import LOOPBACK, Guard
+    from poise.live.open.open_server import OpenServer, Runs
     from poise.live.open.project import FILE, Project
-    from poise.live.open.server import OpenServer, Runs
 
     if len(clips) == 1 and (clips[0] / FILE).is_file():
         project, clips = clips[0], ()
@@ -101,7 +101,7 @@ def stated(reading: Reading) -> dict[str, Any]:
 
 
 def _read(path: str, reading: dict[str, Any]) -> Clip:
-    paths = {k: Path(v) if k == "skeleton" else v for k, v in reading.items()}
+    paths: dict[str, Any] = {k: Path(v) if k == "skeleton" else v for k, v in reading.items()}
     return Reading(**paths).read(Path(path))
 
 

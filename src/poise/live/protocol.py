@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live.guard import VERSION
+from poise.live.admission import VERSION
 from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
 from poise.settings import Range, Share, validate

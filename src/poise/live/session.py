@@ -24,7 +24,7 @@ from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
-from poise.live.guard import Guard
+from poise.live.admission import Guard
 from poise.live.page.server import PageServer
 from poise.live.people import STAND, Steady
 from poise.live.points import PointFit

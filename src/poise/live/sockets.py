@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from poise.errors import PoiseError
-from poise.live.guard import EACH, MOST_BYTES, VERSION, Bucket
+from poise.live.admission import EACH, MOST_BYTES, VERSION, Bucket
 from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
 

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.live.admission import parse
 from poise.live.protocol import (
     JOINTS,
     name,
     number,
     numbers,
-    parse,
     points_of,
     skeleton_of,
     turned,

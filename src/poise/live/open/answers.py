@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from poise.live.open.actions import Action
-from poise.live.open.workers import Job
+from poise.live.open.job_processes import Job
 
 
 def problem_of(job: Job) -> str:

@@ -16,7 +16,7 @@ from poise.kinematics import anatomy_of, examine, find_guesses, support_of
 from poise.kinematics.repair.faults import KINDS
 from poise.kinematics.repair.needs import not_alone
 from poise.motion import Clip, find_roles, ground_shift
-from poise.motion.info import describe, standing_height
+from poise.motion.clip_info import describe, standing_height
 from poise.motion.smoothing import find_runs
 from poise.settings import plain
 
@@ -104,7 +104,7 @@ def judged(clip: Clip) -> dict[str, Any]:
     if support is not None:
         touching = support.contacts[1].numpy()
         for foot in dict.fromkeys(support.feet):
-            mine = touching[:, [f == foot for f in support.feet]].any(-1)
+            mine = np.any(touching[:, np.array(support.feet) == foot], axis=-1)
             contacts.append({"joint": foot, "runs": [[a, b + 1] for a, b in find_runs(mine, 1)]})
         level = ground_shift(clip, support.fit.lift_m)
         faults += [
@@ -150,7 +150,7 @@ def rests_of(clip: Clip) -> list[dict[str, Any]]:
     """What a motion rests on, found as `poise track` does it before it simulates, in the world of the
     clip: see `kinematics.supports.Support`."""
     from poise.jobs.open import open_run
-    from poise.jobs.track.supports import at_home
+    from poise.jobs.track.surroundings import at_home
     from poise.jobs.track.tracking import FEATURES, TrackConfig, TrackSession
 
     session = TrackSession(open_run(None).tracker, TrackConfig(), [clip])

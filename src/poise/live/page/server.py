@@ -11,7 +11,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from poise.errors import PoiseError
-from poise.live.guard import MOST_BYTES, VERSION, Bucket, Guard, parse
+from poise.live.admission import MOST_BYTES, VERSION, Bucket, Guard, parse
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, WebServer, path_of
 from poise.live.protocol import command
 from poise.live.sources import JsonStream, Takes

@@ -16,7 +16,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from poise.errors import PoiseError
-from poise.live.guard import WAITING, Guard, GuardedSocket, pauses
+from poise.live.admission import WAITING, Guard, GuardedSocket, pauses
 
 #: A page: the room that holds it, its name among the assets there, its type.
 Asset = tuple[str, str, str]

@@ -19,7 +19,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from poise.errors import PoiseError
-from poise.live.guard import VERSION, Bucket, Guard, parse
+from poise.live.admission import VERSION, Bucket, Guard, parse
 from poise.live.open.actions import (
     ACTIONS,
     EXPORTS,
@@ -32,8 +32,8 @@ from poise.live.open.actions import (
     words_of,
 )
 from poise.live.open.answers import motion_of, problem_of, sentences
+from poise.live.open.job_processes import Job, Workers
 from poise.live.open.project import LARGEST, Project, Take, clean_name, safe_file, write_json
-from poise.live.open.workers import Job, Workers
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, Content, WebServer
 
 SCRIPTS = ("figure", "stage_view", "timeline", "forms", "open")
