@@ -80,6 +80,16 @@ def test_fix_writes_the_clip_without_its_faults(broken: Path, tmp_path: Path, ca
     assert np.linalg.norm(mended.positions() - original.positions(), axis=-1).max() < 0.03
 
 
+def test_notes_of_a_repair_are_sentences_and_told_once(broken: Path, tmp_path: Path, capsys) -> None:
+    assert main(["doctor", str(broken), "--fix", "-o", str(tmp_path / "a.bvh")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    told = [line.removeprefix("  - ") for line in lines if line.startswith("  - ")]
+    assert all(len(note) > 8 for note in told) and len(told) == len({*told})
+    argv = ["doctor", str(broken), "--fix", "-o", str(tmp_path / "b.bvh"), "--json"]
+    assert main(argv) == 0
+    assert isinstance(json.loads(capsys.readouterr().out)["notes"], list)
+
+
 def test_after_is_what_doctor_says_of_the_written_file(tmp_path: Path, capsys) -> None:
     """A T-pose before the motion is left out when it is read, so that the written file has none."""
     clip = read_clip(WALK)

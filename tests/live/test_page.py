@@ -191,6 +191,14 @@ def test_others_need_the_token() -> None:
         assert "token=secret word" in out.server.url
         assert out.get("/")[0] == 401 and out.get("/?token=no")[0] == 401
         assert out.get("/?token=secret%20word")[0] == 200
+        # Scripts of the page come without the token in their address: the browser keeps it.
+        asked = urllib.request.Request(f"http://{out.where}/?token=secret%20word")
+        with urllib.request.urlopen(asked, timeout=10) as got:
+            cookie = got.headers["Set-Cookie"]
+        assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
+        kept = cookie.partition(";")[0]
+        assert out.get("/live.js")[0] == 401 and out.get("/live.js", Cookie=kept)[0] == 200
+        assert out.get("/live.js", Cookie=kept.replace("secret", "guess"))[0] == 401
     finally:
         out.server.close()
 
