@@ -46,6 +46,7 @@ def page(server: OpenServer, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     with opened(server.url, tmp_path_factory.mktemp("profile")) as one:
         # Small, since pictures are drawn without a GPU.
         one.size(480, 400)
+        one.until("window.poiseOpen && poiseOpen.state.project", 60)
         yield one
         assert one.errors == []
 
@@ -147,6 +148,7 @@ def test_a_motion_is_mended_gets_a_body_is_pushed_and_goes_out(
 def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: Page) -> None:
     """Frames that stay are marked by hand, the page goes on drawing, and Stop stops."""
     choose(page, "video mended")
+    press(page, "k")
     for frame in (0, 40, 85):
         page.js(f"poiseOpen.seek({frame})")
         press(page, "s")

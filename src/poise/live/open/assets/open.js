@@ -229,7 +229,8 @@
     const work = project.jobs.filter((j) => j.lane === "work" || j.label === "Exporting");
     $("jobs").hidden = !work.length;
     const rows = work.map((j) => {
-      const bar = make("progress", j.share === null ? {} : { value: j.share });
+      // A bar without a share would move all the time, and with it the page be drawn.
+      const bar = make("progress", { value: j.share || 0 });
       bar.setAttribute("aria-label", j.label);
       const stop = make("button", { textContent: j.state === "stopping" ? "Stopping" : "Stop", disabled: j.state === "stopping", onclick: () => send({ type: "stop", job: j.id }) });
       const text = j.state === "waiting" ? "waits for the one before" : j.text || "starting";
@@ -599,6 +600,7 @@
     $("files").click();
   }
   async function takeFiles(files, why = "") {
+    if (!hello) return toast("The page is not connected yet. Drop it again.", "refused");
     const first = current(), came = [];
     // Companions, such as an ASF, must be there when the motion is read.
     const sorted = [...files].sort((a, b) => /\.(amc|gltf)$/i.test(a.name) - /\.(amc|gltf)$/i.test(b.name));
