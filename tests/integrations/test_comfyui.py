@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+import time
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -95,6 +96,22 @@ def test_tracking_gives_paths_and_says_a_loss(
     complete = nodes.NODE_CLASS_MAPPINGS["PoiseComplete"]()
     complete.run("a dance.bvh", " 0, 30 60")
     assert words(tmp_path)[2:4] == ["--keyframes", "0,30,60"] and "--fps" not in words(tmp_path)
+
+
+def test_a_motion_is_opened_on_the_page(
+    nodes: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan(tmp_path, monkeypatch, answer={})
+    (tmp_path / "input/run.bvh").write_text("x")
+    path = tmp_path / "input/run.bvh"
+    assert nodes.NODE_CLASS_MAPPINGS["PoiseOpen"]().run("run.bvh", fps=24.0) == (str(path),)
+    end = time.monotonic() + 30
+    while not (tmp_path / "words.json").exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    project = str(tmp_path / "output/poise/run_open_00001.project")
+    assert words(tmp_path) == [
+        *("open", str(path), "--project", project, "--port", "0", "--once", "--fps", "24"),
+    ]
 
 
 def test_what_is_refused_is_an_error_in_a_sentence(

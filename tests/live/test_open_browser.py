@@ -153,6 +153,8 @@ def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: P
         page.js(f"poiseOpen.seek({frame})")
         press(page, "s")
     assert page.js("poiseOpen.forms().get('between').values.keyframes") == [0, 40, 85]
+    said = "document.querySelector('#action-between .line').textContent"
+    assert "--keyframes 0,40,85" in page.until(f"{said}.includes('85') && {said}", 20)
     do(page, "between")
     page.until("document.body.dataset.busy === 'yes'")
     press(page, " ")

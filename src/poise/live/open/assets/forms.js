@@ -27,7 +27,8 @@ function actionForms(host, actions, world) {
     plain.append(form.run, form.why, fold);
     form.box = make("details", { className: "action", id: `action-${action.name}` }, make("summary", { textContent: action.label }), plain);
     form.box.addEventListener("toggle", () => {
-      if (!form.box.open) return world.opened(null);
+      // The one that closes since another opened says nothing.
+      if (!form.box.open) return world.now() === form ? world.opened(null) : undefined;
       for (const other of forms.values()) if (other !== form) other.box.open = false;
       world.opened(form);
       form.refresh();

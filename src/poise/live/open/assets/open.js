@@ -52,7 +52,7 @@
     }
     line = timelineView($("timeline"), { seek, fault: goFault, range: setRange });
     forms = actionForms($("actions"), hello.actions, {
-      run, rests: () => send({ type: "rests", take: current() }), openRig: () => pickFiles("rig"), opened: opens,
+      run, rests: () => send({ type: "rests", take: current() }), openRig: () => pickFiles("rig"), opened: opens, now: () => opened,
       rigs: () => (project ? project.takes : []).filter((t) => t.id !== current()).map((t) => [t.id, t.name]),
       frame: () => Math.round(frame), frames: () => (motion() ? motion().frames : 1), range: () => range,
       rangeText: () => (range ? `frames ${range[0]} to ${range[1]}` : "mark one on the timeline: I and O, or Shift and drag"),
@@ -133,7 +133,7 @@
     if (!t) { view.show(null, null); line.show(null); return; }
     const fresh = !kept.has(t.id) && before && t.parent === before;
     if (!fresh && kept.has(t.id) && !related(t.id, before)) frame = kept.get(t.id);
-    else if (!related(t.id, before)) { frame = 0; view.frame(); range = null; }
+    else if (!related(t.id, before)) { frame = 0; view.frame(); setRange(null); }
     compare = t.parent && take(t.parent) ? t.parent : "";
     if (!compare && before && take(before) && take(before).parent === t.id) compare = before;
     for (const one of project.takes) for (const kind of ["figure", "judged"]) if (wanted(one, kind)) load(one, kind);
@@ -300,7 +300,9 @@
     $("faulty").dataset.words = words;
     $("guess-line").textContent = `${m.up_axis} up, ${unitName(m.unit_m)}, ${Number(m.fps.toPrecision(4))} Hz, ${m.height_m.toFixed(2)} m tall`;
     guesses(m, j, t);
-    $("fault-line").textContent = !j ? "looking" : j.faults.length ? `${j.faults.length}` : "nothing wrong was found";
+    const alone = j ? j.faults.filter((f) => f.kind === "support missing").length : 0;
+    const rest = alone ? `, and ${alone} where a support is missing` : "";
+    $("fault-line").textContent = !j ? "looking" : j.faults.length ? `${j.faults.length - alone}${rest}` : "nothing wrong was found";
     const all = (j ? j.faults : []).map((f, k) => [f, k]);
     const rows = [...new Set(all.map(([f]) => f.kind))].map((kind) => {
       const of = all.filter(([f]) => f.kind === kind), b = make("b");
@@ -382,7 +384,8 @@
   function setRange(next) {
     const m = motion();
     range = next && m ? [Math.max(next[0], 0), Math.min(next[1], m.frames - 1)] : null;
-    $("range-line").textContent = range ? `range ${range[0]}–${range[1]}` : "";
+    $("range-line").textContent = range ? `range ${range[0]}–${range[1]} ✕` : "";
+    $("range-line").hidden = !range;
     if (opened) opened.refresh();
     timeline();
     if (opened) askLine(opened);
@@ -654,6 +657,7 @@
   const step = (by) => { play(0); seek(Math.round(frame) + by); };
   $("back").onclick = () => step(-1);
   $("next").onclick = () => step(1);
+  $("range-line").onclick = () => setRange(null);
   $("play").onclick = () => play(playing ? 0 : 1);
   $("joint").onchange = () => { joint = $("joint").value; seen = true; timeline(); };
   $("axis").onchange = $("mode").onchange = timeline;

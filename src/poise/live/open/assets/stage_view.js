@@ -6,6 +6,8 @@ function stageView(host, over) {
   });
   const { T, css, scene, camera, controls, place, solid } = base;
   controls.dampingFactor = 0.14;
+  camera.position.set(3.6, -3.6, 2.2);
+  controls.target.set(0, 0, 0.9);
   const point = new T.Vector3(), ink = over.getContext("2d");
   const materials = () => ["", "left", "right"].map(() => new T.MeshStandardMaterial({ roughness: 0.6 }));
   const ghostly = () => ["", "left", "right"].map(() => new T.MeshBasicMaterial({ transparent: true, opacity: 0.34, depthWrite: false }));
