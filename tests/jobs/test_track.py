@@ -308,3 +308,25 @@ def test_a_joint_beyond_its_range_is_no_blow(tracker: Tracker) -> None:
     assert (placed.qpos[:, 7:] >= ranges[:, 0]).all() and (placed.qpos[:, 7:] <= ranges[:, 1]).all()
     assert any("which is widened" in n for n in placed.notes)
     assert imitation_of(tracker, [place(clip, tracker)]).humanoid is tracker.humanoid
+
+
+def test_a_hand_leads_as_far_as_it_is_allowed(tracker: Tracker) -> None:
+    """What a policy loses, a strong hand does with it; a weak one gives no more than it may."""
+    clip = shorter()
+    alone, weak, strong = (
+        track(clip, tracker, controller="policy", supports="none", help_limit=n)
+        for n in (0.0, 5.0, 2000.0)
+    )
+    assert alone.card.help.limit_n == 0.0 == alone.card.help.force_mean_n
+    assert not [n for n in alone.notes if n.startswith("Helped")]
+    assert weak.card.help.limit_n == 5.0 and 0.0 < weak.card.help.force_p95_n <= 5.0 * (1 + 1e-5)
+    assert strong.card.mpjpe_global_mm < alone.card.mpjpe_global_mm
+    (said,) = [n for n in strong.notes if n.startswith("Helped")]
+    assert "up to 2000 N" in said and "of the body's weight" in said
+    ahead = track(
+        clip, tracker, controller="lookahead", supports="none", help_limit=50.0,
+        lookahead=LookaheadConfig(candidates=4, smoothing=(0.0,)), threads=1,
+    )  # fmt: skip
+    assert 0.0 < ahead.card.help.force_p95_n <= 50.0 * (1 + 1e-5)
+    with refused("single-character-only", says="help is for a single character"):
+        TrackConfig(help_limit=10.0, count=2)

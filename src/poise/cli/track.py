@@ -40,16 +40,17 @@ if TYPE_CHECKING:
 
     Tracking: TypeAlias = Any
 else:
-    NAMES = "controller body reset_on_fail recover count seed threads in_place"
+    NAMES = "controller body reset_on_fail recover count seed threads in_place help_limit"
     Tracking = derived(TRACK, "", *NAMES.split())
 
 
 @dataclass(frozen=True)
 class Options:
-    """Let a trained policy do a motion that it need not know, without help and without training: write
-    the motion, score.json and report.html. It looks ahead, and a motion that is lost so is searched;
-    what is lost then it can --learn. Several motions are done one after another in one episode, each
-    where it stands: between them the character walks, turns and gets up to the next one's start."""
+    """Let a trained policy do a motion that it need not know, without training, and without help unless
+    some is allowed: write the motion, score.json and report.html. It looks ahead, and a motion that is
+    lost so is searched; what is lost then it can --learn. Several motions are done one after another in
+    one episode, each where it stands: between them the character walks, turns and gets up to the next
+    one's start."""
 
     out: Out
     clips: Annotated[

@@ -53,6 +53,8 @@ class TrackConfig:
         direction: parts that count more, stay put or are touched.
         retake: a part that is simulated anew, while the rest stays as an earlier result has it.
         push: a push in it, to which the character gives way.
+        help_limit: N, and N m, that a hand which leads the root may give at most, by inverse dynamics
+            and a spring; 0 for none. No real person has such help: notes and score card state it.
         in_place: a clip that walks in place is simulated with the travel that its feet tell. auto writes
             it in place again, a loop as a loop; travel writes it with its travel; keep simulates it as
             it is.
@@ -75,6 +77,7 @@ class TrackConfig:
     direction: Direction = part("poise.jobs.track.direction:Direction")
     retake: Retake | None = part("poise.jobs.track.simulation:Retake", made=False)
     push: PushConfig | None = part("poise.jobs.track.pushed:PushConfig", made=False)
+    help_limit: Annotated[float, Range(0, unit="N")] = 0.0
     in_place: Mode = "auto"
 
     def __post_init__(self) -> None:
@@ -136,5 +139,6 @@ RULES: dict[str, tuple[Callable[[TrackConfig], bool], tuple[str, ...]]] = {
     "weights, pins and touches": (lambda c: bool(c.direction), (_COMES, _MANY)),
     "a range": (lambda c: c.retake is not None, (_COMES, _BACK, _MANY, "noise", "a search")),
     "a push": (lambda c: c.push is not None, (_COMES, _BACK, _MANY, "noise", "a range", "a search")),
+    "help": (lambda c: c.help_limit > 0, (_COMES, _BACK, _MANY, "a range", "a push")),
     "a support": (lambda c: isinstance(c.supports, tuple), (_COMES, _MANY)),
 }

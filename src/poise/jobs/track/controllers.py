@@ -15,7 +15,7 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.result import RULE, merit
 from poise.jobs.track.placement import PlacedMotion
 from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
-from poise.jobs.track.recovery_run import RecoveryRun, ReplayActions, led_along, look_for, replay
+from poise.jobs.track.recovery_run import RecoveryRun, ReplayActions, helped, led_along, look_for, replay
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.track.surroundings import crowd
 from poise.jobs.tracker import Tracker
@@ -99,7 +99,8 @@ def done_by(
         # What was found is judged as it is played again, as the score card does.
         again = episode(imitation, config, replay(found, tracker.policy), "search")
         done, earlier = max(done, again, key=lambda x: merit(x.rollouts)), done
-        notes.append(searched(again, earlier, done, found, how, imitation.reference.rate_hz))
+        rate_hz, leads = imitation.reference.rate_hz, config.help_limit > 0
+        notes.append(searched(again, earlier, done, found, how, rate_hz, leads))
         done = done._replace(found=found)
     return done, notes
 
@@ -111,15 +112,17 @@ def searched(
     found: SamplingResult,
     config: SamplingConfig,
     rate_hz: float,
+    helped: bool = False,
 ) -> str:
     """What a search came to, and what is kept of it.
 
     Args:
         again: what was found, played again. earlier: what was done before it. kept: one of the two.
+        helped: whether a hand led the root.
     """
     said = (
         f"The motion was lost; {config.characters} characters looked for it, {found.tries:,} control "
-        "steps, without help, and"
+        f"steps, {'with' if helped else 'without'} help, and"
     )
     if not again.failures:
         return f"{said} found it to its end."
@@ -176,7 +179,13 @@ def look_ahead(
     copies = (
         unforeseen(imitation)
         .bare(rewards=True)
-        .env(config.candidates, auto_reset=False, threads=threads, help_scale=0.0, guard=False)
+        .env(
+            config.candidates,
+            auto_reset=False,
+            threads=threads,
+            help_scale=helped(imitation),
+            guard=False,
+        )
     )
     return Lookahead(copies, tracker.policy, tracker.value, replace(config, seed=seed), prices)
 
@@ -184,7 +193,7 @@ def look_ahead(
 def loses(tracker: Tracker, imitation: Imitation) -> bool:
     """Whether the policy alone loses a task's first motion."""
     first = torch.zeros(1, dtype=torch.long)
-    results = evaluate_clips(imitation, tracker.policy, first, 0.0, 1)
+    results = evaluate_clips(imitation, tracker.policy, first, helped(imitation), 1)
     return not bool(results.succeeded)
 
 
@@ -195,7 +204,7 @@ def episode(
     count, task = config.count, imitation
     every = torch.arange(count)
     rows = crowd(task.humanoid, task.config.sim, count) if count > 1 else None
-    env = task.env(1, None, False, 1, help_scale=0.0, backend=rows)
+    env = task.env(1, None, False, 1, help_scale=helped(task), backend=rows)
     if callable(watch := getattr(acts, "watch", None)):
         watch(env)
     keeper = ResetOnFail(env, acts) if config.reset_on_fail else None
@@ -209,7 +218,7 @@ def episode(
     observers = [*told, touched, states] if count == 1 else told
     observers += [] if push is None else [push]
     rollouts, recordings = run_episodes(
-        lambda _: env, keeper or acts, every, starts, cycles=1, observers=observers
+        lambda _: env, keeper or acts, every, starts, config.help_limit, 1, observers
     )
     if count == 1:
         seen = touched.frames if push is None else push.arrows

@@ -19,14 +19,13 @@ from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
 from poise.jobs.track.placement import PlacedMotion, place
 from poise.jobs.track.surroundings import Wanted, with_supports
-from poise.jobs.track.tracking import BESIDE, brought_home, imitation_of
+from poise.jobs.track.tracking import BESIDE, brought_home, imitation_of, with_guide
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened
 from poise.kinematics.repair.estimate import clean_clip
 from poise.learn import LATEST, PolicyBundle, Until
 from poise.metrics import success_rule
 from poise.motion import Clip, ClipLibrary
-from poise.plan import Guide, make_plan
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.score import ClipResults
@@ -41,16 +40,6 @@ STARTS = 16
 #: Where in the training the help has ended at the latest, and the noise on the residual action beside
 #: the hand that leads, in units of the limit.
 ENDS, NOISE = 0.6, 0.02
-
-
-def with_guide(imitation: Imitation) -> Imitation:
-    """The task of `helped` settings with a hand that leads the root, as far as the help's limit goes."""
-    residual = imitation.task.residual
-    if residual is None:
-        return imitation
-    plan = make_plan(imitation.reference)
-    guide = Guide(imitation.reference, residual, plan.force_h, plan.torque_b)
-    return replace(imitation, task=replace(imitation.task, guide=guide))
 
 
 def helped(config: Perpetual, newtons: float) -> Perpetual:

@@ -45,6 +45,11 @@ class ReplayActions:
         return self.actions[at : at + 1]
 
 
+def helped(imitation: Imitation) -> float:
+    """The share of its help's limits that a task has: all of them, or nothing where it has none."""
+    return 1.0 if imitation.task.guide is not None else 0.0
+
+
 def look_for(
     tracker: Tracker,
     imitation: Imitation,
@@ -53,13 +58,13 @@ def look_for(
     threads: int = 0,
     show: Callable[[int, int], None] | None = None,
 ) -> SamplingResult:
-    """Looks for one of a task's motions with the tracker's policy, without help.
+    """Looks for one of a task's motions with the tracker's policy and the task's help.
 
     threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
     """
     # Worlds that lose the motion may go bad; they are left behind.
     env = imitation.bare(rewards=True).env(
-        config.characters, auto_reset=False, threads=threads, help_scale=0.0, guard=False
+        config.characters, auto_reset=False, threads=threads, help_scale=helped(imitation), guard=False
     )
     try:
         return SamplingControl(env, tracker.policy, config, tracker.value, clip).run(show)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from poise.body.humanoid import make_humanoid
+from poise.control import ImplicitResidual
 from poise.env import Reference
 from poise.errors import PoiseError
 from poise.formats import read_clip
@@ -56,6 +57,7 @@ from poise.metrics import detail, deviations, has_lost, mpjpe_global
 from poise.motion import Clip, ClipLibrary
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import perturb_clip, perturb_points
+from poise.plan import Guide, make_plan
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
 from poise.settings import changed
@@ -284,6 +286,26 @@ def _support(s: TrackSession) -> None:
     s.notes += [one.sentence() for one in s.supports]
 
 
+def _help(s: TrackSession) -> None:
+    """A hand leads the root; the policy's own actions have no part in it."""
+    residual = ImplicitResidual(s.config.help_limit, s.config.help_limit)
+    hinges = len(s.imitation.humanoid.hinges)
+    policy = s.tracker.policy.with_actions(hinges).with_actions(hinges + residual.dims)
+    s.tracker = replace(s.tracker, policy=policy)
+    own = replace(s.imitation.task, residual=residual, help_by="all")
+    s.imitation = with_guide(replace(s.imitation, task=own))
+
+
+def _helped(s: TrackSession, result: Result) -> Result:
+    used = result.evaluation.card.help
+    said = (
+        f"Helped: a hand that no real person has led the root with up to {used.limit_n:g} N, "
+        f"{used.force_mean_n:.0f} N on average, {used.share_of_body_weight:.0%} of the body's weight, "
+        f"{used.work_j_per_s:.0f} J a second."
+    )
+    return replace(result, notes=(*result.notes, said))
+
+
 def _push(s: TrackSession) -> None:
     s.imitation = with_push(s.imitation, s.config.push)
 
@@ -378,6 +400,7 @@ FEATURES = (
     Feature(lambda s: bool(s.config.direction), _direct),
     Feature(lambda _: True, _place),
     Feature(lambda s: not s.leads and s.config.count == 1, _support),
+    Feature(lambda s: s.config.help_limit > 0, _help, _helped),
     Feature(lambda s: s.config.push is not None, _push, _pushed),
     Feature(lambda s: s.config.count > 1, _crowd),
     Feature(lambda s: s.leads, _lead, _led),
@@ -422,6 +445,16 @@ def imitation_of(tracker: Tracker, placed: Sequence[PlacedMotion]) -> Imitation:
     reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)
     own = task(config, humanoid, guided=tracker.recovery_clips is not None)
     return Imitation(library, humanoid, reference, placed[0].report, config, own, tracker.recovery_clips)
+
+
+def with_guide(imitation: Imitation) -> Imitation:
+    """A task with help in which a hand leads the root, as far as the help's limit goes."""
+    residual = imitation.task.residual
+    if residual is None:
+        return imitation
+    plan = make_plan(imitation.reference)
+    guide = Guide(imitation.reference, residual, plan.force_h, plan.torque_b)
+    return replace(imitation, task=replace(imitation.task, guide=guide))
 
 
 def side_by_side(imitation: Imitation, count: int) -> Imitation:
