@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import socket
 import struct
 import urllib.error
 import urllib.request
@@ -20,7 +21,9 @@ from toy_jobs import toy_look, toy_rests, toy_work
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from poise.cli.open import _free
 from poise.cli.parse import options_of
+from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.live.admission import Guard
 from poise.live.open.actions import ACTIONS, EXPORTS, reading_of, reading_words, words_of
@@ -186,6 +189,28 @@ def _status(client: Client, path: str, **headers: str) -> int:
         return problem.code
 
 
+def test_settings_of_any_kind_are_words_or_refused():
+    """Whatever JSON a page sends for a setting, it becomes plain words or a sentence."""
+    rng = np.random.default_rng(1)
+    atoms: list[Any] = [None, True, -1, 3, 1e300, 0.5, "", "--force", "a=b", "left_hand", [], {}, [[]]]
+    atoms += [[1, 2], ["left_hand", 1, 2], [["left_hand", 1, 2]], [["right_hand", 5, 0, 0, 1]], {"x": 1}]
+    made = 0
+    for action in ACTIONS.values():
+        for _ in range(150):
+            given = {
+                f.name: atoms[rng.integers(len(atoms))] for f in action.fields if rng.random() < 0.4
+            }
+            try:
+                words = words_of(action, given, 50, {"left_hand": Path("rig.bvh")}, Path("boxes.json"))
+            except PoiseError:
+                continue
+            made += 1
+            flags = [w for w in words if w.startswith("--")]
+            known = {*action.words, *(f"--{f.flag or f.name}" for f in action.fields)}
+            assert {w.partition("=")[0] for w in flags} <= known, given
+    assert made > 200
+
+
 def test_strangers_are_kept_out(client: Client):
     key = "token=secret-word"
     for path in PAGES:
@@ -294,6 +319,8 @@ def test_settings_as_words():
     given = {"keyframes": [40, 0, 85], "touches": [["right_hand", 60, 0.2, 0.5, 1.2]]}
     words = words_of(ACTIONS["between"], given, 86, {}, Path("b"))
     assert " ".join(words) == "--keyframes 0,40,85 --touch right_hand:60:0.2,0.5,1.2"
+    words = words_of(ACTIONS["rig"], {"maps": ["Arm=upperarm_l", "--x=y"]}, 86, {}, Path("b"))
+    assert words == ["--map=Arm=upperarm_l", "--map=--x=y"]
     assert words_of(ACTIONS["cut"], {"frames": [5, 9]}, 86, {}, Path("b")) == ["--frames", "5-9"]
     words = words_of(ACTIONS["range"], {"span": [1.0, 2.5]}, 86, {}, Path("b"))
     assert words == ["--range=1-2.5", "--seed", "1"]
@@ -349,3 +376,13 @@ def test_a_foot_that_slides_is_marked_where_it_does():
     assert 40 < max(f["size"] for f in marks) < 75 and {f["unit"] for f in marks} == {"cm"}
     assert found["judged"] and {g["what"] for g in found["guesses"]} >= {"up", "unit", "fps"}
     assert len(found["contacts"]) == 2
+
+
+def test_a_second_page_takes_another_port(monkeypatch: pytest.MonkeyPatch):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr("poise.cli.open.PORT", port)
+        assert _free("127.0.0.1", port) == 0
+    assert _free("127.0.0.1", port) == port
+    # One that was named is taken at its word.
+    assert _free("127.0.0.1", 9) == 9

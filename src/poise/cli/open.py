@@ -7,6 +7,7 @@ import json as json_
 import math
 import secrets
 import signal
+import socket
 import sys
 import threading
 import time
@@ -30,6 +31,8 @@ PRELOAD = (
     *("torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.jobs.track"),
     *("poise.jobs.complete", *(f"poise.cli.{verb}" for verb in VERBS)),
 )
+#: The usual port.
+PORT = 8018
 #: s between two lines of progress of a job.
 PROGRESS_S = 0.25
 #: s after which a server without pages ends with --once.
@@ -40,7 +43,7 @@ def run(
     clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE ...", help_behavior_hint="")] = (),
     project: Annotated[Path, arg(aliases=["-o"], metavar="DIR")] = Path("poise-project"),
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
-    port: Annotated[int, arg(metavar="PORT")] = 8018,
+    port: Annotated[int, arg(metavar="PORT")] = PORT,
     browser: Flag = True,
     once: Flag = False,
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None,
@@ -56,7 +59,7 @@ def run(
         project: the folder of what is made; what is there already is shown again.
         host: the address to listen on. Any other than this machine's own lets others in that know the
             token in the address.
-        port: the port of the page; 0 takes a free one.
+        port: the port of the page; 0 takes a free one, and so does the usual one where it is taken.
         browser: open no browser; the address is printed.
         once: end a minute after the last page was closed.
         seconds: end after so many seconds.
@@ -75,7 +78,7 @@ def run(
             what = folder if path.is_dir() else "there is no such file"
             raise PoiseError(what, path, "Name motion files", code="file-missing")
     held = Project(project)
-    guard = Guard(host, port, secrets.token_urlsafe(24))
+    guard = Guard(host, _free(host, port), secrets.token_urlsafe(24))
     server = OpenServer(held, guard, Runs(work, look, rests, PRELOAD))
     try:
         for path in reversed(clips):
@@ -92,6 +95,21 @@ def run(
     finally:
         server.close()
     return Answer({"motions": len(held.takes)}, {"project": held.folder / FILE})
+
+
+def _free(host: str, port: int) -> int:
+    """The port; 0, which takes a free one, where it is the usual one and another page has it."""
+    if port == PORT:
+        try:
+            with socket.create_server((host, port), family=_family(host)):
+                return port
+        except OSError:
+            return 0
+    return port
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def stated(reading: Reading) -> dict[str, Any]:

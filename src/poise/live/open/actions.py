@@ -217,7 +217,7 @@ def _words(f: Field, value: Any, frames: int, onto: Mapping[str, Path], boxes: P
         case "flag":
             return [flag] if bool(value) != f.negative else []
         case "take":
-            if value not in onto:
+            if not isinstance(value, str) or value not in onto:
                 raise PoiseError("the rig is no motion of this project", code="unknown-take")
             return [flag, str(onto[value])]
         case "frames":
@@ -252,7 +252,7 @@ def _words(f: Field, value: Any, frames: int, onto: Mapping[str, Path], boxes: P
                 for a, _, b in (r.partition("=") for r in rows)
             ):
                 raise _wrong(f.label)
-            return [w for r in rows for w in (flag, r)]
+            return [f"{flag}={row}" for row in rows]
 
 
 def suffix_for(action: Action, home: str, onto: Path | None) -> str:

@@ -350,6 +350,10 @@ class OpenServer:
                 self.guard.refused[problem.code] += 1
                 said += 1
                 answer = {"type": "refused", "why": str(problem)} if said <= TOLD else None
+            except OSError as problem:
+                # The disk is full, or the project's folder is gone.
+                why = f"The project cannot be written ({(problem.strerror or '').lower()})."
+                answer = {"type": "refused", "why": why}
             if answer is not None:
                 await connection.send(json.dumps({"v": VERSION, **answer}))
 
