@@ -21,6 +21,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.motion import trim
 from poise.settings import plain
+from sparing import spare
 from toy_policy import WALK, toy_run
 
 #: No lookahead.
@@ -84,6 +85,7 @@ def test_every_verb_answers_in_one_schema(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr("poise.cli.demo.WALK", short)
+    spare(monkeypatch)
     argv, code = lines(verb, short, clip, trained, tmp_path)
     found = answered(verb, *argv, code=code)
     check(found)

@@ -105,7 +105,7 @@ def test_the_fused_step_equals_the_plain_one(make_env, settings):
         over = step.terminated | step.truncated
         ended += int(over.sum())
         # Whether a world goes on or has just begun anew, it is seen as from nothing.
-        torch.testing.assert_close(step.obs, env._observe(), atol=2e-6, rtol=2e-6)
+        torch.testing.assert_close(step.obs, env.observe(), atol=2e-6, rtol=2e-6)
         plain = plain_observation(env)
         torch.testing.assert_close(step.obs, plain.float(), atol=2e-5, rtol=2e-5)
         assert torch.equal(step.obs[~over], step.final_obs[~over])

@@ -28,20 +28,20 @@ def stepped(optimizer: Any, params: list[torch.nn.Parameter], steps: int, seed: 
         optimizer.step()
 
 
-@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("how", [{"fused": True}, {"fused": False}, {"fused": False, "amsgrad": True}])
 @pytest.mark.parametrize("decay", [0.0, 0.3])
-def test_it_is_torchs_to_the_bit(fused: bool, decay: float) -> None:
+def test_it_is_torchs_to_the_bit(how: dict[str, bool], decay: float) -> None:
     mine, theirs = weights(), weights()
-    a = Adam(mine, 1e-3, (0.9, 0.98), weight_decay=decay, fused=fused)
-    make = torch.optim.AdamW if decay else torch.optim.Adam
-    b = make(theirs, 1e-3, (0.9, 0.98), weight_decay=decay, fused=fused)
+    a = Adam(mine, 1e-3, (0.9, 0.98), weight_decay=decay, **how)
+    make: Any = torch.optim.AdamW if decay else torch.optim.Adam
+    b = make(theirs, 1e-3, (0.9, 0.98), weight_decay=decay, **how)
     for optimizer, params in ((a, mine), (b, theirs)):
         stepped(optimizer, params, 6, 1)
     assert all(torch.equal(x, y) for x, y in zip(mine, theirs, strict=True))
     one, two = optimizer_state(a), optimizer_state(b)
     assert one.keys() == two.keys() and all(torch.equal(one[k], two[k]) for k in one)
     # Each goes on from what the other had.
-    c, d = Adam(mine, fused=fused, weight_decay=decay), make(theirs, weight_decay=decay, fused=fused)
+    c, d = Adam(mine, weight_decay=decay, **how), make(theirs, weight_decay=decay, **how)
     load_optimizer_state(c, two)
     load_optimizer_state(d, one)
     for optimizer, params in ((c, mine), (d, theirs)):

@@ -223,7 +223,7 @@ class ImitationEnv:
         if self.goal.begins:
             self._place(None, None)
         self.num_obs = self.observe().shape[1]
-        self._style = seen_by(self._terms.style, self._frame())
+        self._style = seen_by(self._terms.style, self.view())
         self._obs = torch.empty(n, self.num_obs, device=here)
 
     def _make_terms(self, fused: bool) -> Terms:
@@ -459,7 +459,7 @@ class ImitationEnv:
         """What world `env` is at, for messages."""
         return self.goal.where(env)
 
-    def _frame(self) -> Frame:
+    def view(self) -> Frame:
         """What the terms see of all worlds, from nothing but where they are."""
         return self._terms.frame(self._sources.live(self._told()))
 
@@ -476,7 +476,7 @@ class ImitationEnv:
     def columns(self) -> dict[str, slice]:
         """The columns of the observations by name, in order: those of each term, such as
         "rotation_goal", and of its parts, such as "rotation_goal.linvel", see `ObsTerm.parts`."""
-        out, frame = dict[str, slice](), self._frame()
+        out, frame = dict[str, slice](), self.view()
         first = 0
         for term in self._terms.obs:
             width = seen_by((term,), frame).shape[1]

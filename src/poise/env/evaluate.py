@@ -166,7 +166,7 @@ class Terms:
         observables: what frames know, by name.
         context: what all frames share.
         horizon: control steps until an episode times out.
-        fused: replay a recording of the first evaluation, see `record`; on the CPU only.
+        fused: replay a recording once they are often evaluated, see `Recorded`; on the CPU only.
     """
 
     def __init__(
@@ -292,5 +292,9 @@ class Terms:
             def flat(*tensors: Tensor) -> tuple[Tensor, ...]:
                 return plain(dict(zip(names, tensors, strict=True)))
 
-            self._recorded[name] = record(flat, tuple(sources.values()))
+            given = tuple(sources.values())
+            # Many worlds are trained, and two threads need a recording. What is called as seldom as
+            # when a motion is tried once is sooner done without: both do the same to the bit.
+            many = 2 * len(sources["age"]) >= MANY
+            self._recorded[name] = record(flat, given) if many or OFTEN == 1 else Recorded(flat)
         return self._recorded[name](*sources.values())

@@ -27,6 +27,7 @@ class Adam:
         lr, betas, eps: alpha, (beta_1, beta_2) and epsilon.
         weight_decay: lambda.
         fused: one kernel steps all parameters of a group, which have one type and lie on one device.
+        amsgrad: steps are by the largest second moment so far (Reddi et al. 2018, Algorithm 2); not fused.
 
     Attributes:
         param_groups: of each group its `params`, and its `lr` and `weight_decay`, which may be changed.
@@ -41,6 +42,7 @@ class Adam:
         eps: float = 1e-8,
         weight_decay: float = 0.0,
         fused: bool = True,
+        amsgrad: bool = False,
     ):
         given: list[Any] = list(params)
         groups = [{"params": given}] if given and isinstance(given[0], Tensor) else given
@@ -48,9 +50,9 @@ class Adam:
         self.param_groups: list[dict[str, Any]] = [
             {**plain, **group, "params": list(group["params"])} for group in groups
         ]
-        self.betas, self.eps = betas, eps
+        self.betas, self.eps, self.amsgrad = betas, eps, amsgrad
         # The kernel is no promise of torch's.
-        self.fused = fused and hasattr(torch, "_fused_adam_")
+        self.fused = fused and not amsgrad and hasattr(torch, "_fused_adam_")
         self.state: dict[Tensor, dict[str, Tensor]] = {}
 
     def zero_grad(self, set_to_none: bool = True) -> None:
@@ -69,11 +71,9 @@ class Adam:
             params = [p for p in group["params"] if p.grad is not None]
             for p in params:
                 if p not in self.state:
-                    self.state[p] = {
-                        "step": torch.zeros((), device=p.device),
-                        "exp_avg": torch.zeros_like(p),
-                        "exp_avg_sq": torch.zeros_like(p),
-                    }
+                    names = ("exp_avg", "exp_avg_sq", *(("max_exp_avg_sq",) if self.amsgrad else ()))
+                    own = {"step": torch.zeros((), device=p.device)}
+                    self.state[p] = own | {name: torch.zeros_like(p) for name in names}
             (self._all_at_once if self.fused else self._each)(params, group)
 
     def _all_at_once(self, params: list[Tensor], group: Mapping[str, Any]) -> None:
@@ -101,7 +101,10 @@ class Adam:
             # m_t and v_t, then theta_t = theta_{t-1} - alpha m^_t / (sqrt(v^_t) + epsilon).
             own["exp_avg"].lerp_(p.grad, 1 - b1)
             own["exp_avg_sq"].mul_(b2).addcmul_(p.grad, p.grad, value=1 - b2)
-            root = (own["exp_avg_sq"].sqrt() / (1 - b2**t) ** 0.5).add_(self.eps)
+            second = own["exp_avg_sq"]
+            if self.amsgrad:
+                second = torch.maximum(own["max_exp_avg_sq"], second, out=own["max_exp_avg_sq"])
+            root = (second.sqrt() / (1 - b2**t) ** 0.5).add_(self.eps)
             p.addcdiv_(own["exp_avg"], root, value=-lr / (1 - b1**t))
 
 
