@@ -1,6 +1,7 @@
 """Environments over the small human, whose terms are recorded at the first step."""
 
 import pytest
+
 from toy_envs import make_env, make_phc, make_task  # noqa: F401
 
 

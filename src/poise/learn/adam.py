@@ -27,7 +27,7 @@ class Adam:
         lr, betas, eps: alpha, (beta_1, beta_2) and epsilon.
         weight_decay: lambda.
         fused: one kernel steps all parameters of a group, which have one type and lie on one device.
-        amsgrad: steps are by the largest second moment so far (Reddi et al. 2018, Algorithm 2); not fused.
+        amsgrad: steps are by the largest second moment so far (Reddi et al. 2018, Algorithm 2), unfused.
 
     Attributes:
         param_groups: of each group its `params`, and its `lr` and `weight_decay`, which may be changed.

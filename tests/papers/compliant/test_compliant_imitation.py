@@ -78,9 +78,7 @@ def test_what_the_discriminator_sees_of_a_clip_is_what_it_sees_of_a_character_on
 ) -> None:
     env = env_of(made)
     demos = env.demos(2).at(torch.tensor([0]), torch.tensor([10]))
-    assert torch.allclose(
-        demos[:, : demos.shape[1] // 2], compliant.posture(env.view())[:1], atol=1e-3
-    )
+    assert torch.allclose(demos[:, : demos.shape[1] // 2], compliant.posture(env.view())[:1], atol=1e-3)
 
 
 def test_the_positional_reward_is_equation_14(made: Imitation) -> None:
