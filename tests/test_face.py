@@ -127,14 +127,15 @@ def test_track_gives_the_numbers_of_the_command(tmp_path: Path) -> None:
 
 
 def test_inbetween_gives_the_frames_of_the_command(tmp_path: Path) -> None:
-    keys, out = (0, 20, 41), tmp_path / "out.bvh"
-    made = poise.inbetween(WALK, keys, adapt=2)
+    keys, out, walk = (0, 20, 41), tmp_path / "out.bvh", tmp_path / "walk.bvh"
+    poise.write(trim(poise.read(WALK), 0, 44), walk)
+    made = poise.inbetween(walk, keys, adapt=2)
     command = ["--keyframes", "0,20,41", "--adapt", "2", "-o", str(out)]
-    assert main(["inbetween", str(WALK), *command]) == 0
+    assert main(["inbetween", str(walk), *command]) == 0
     made.save(tmp_path / "mine.bvh")
     np.testing.assert_array_equal(poise.read(tmp_path / "mine.bvh").rot, poise.read(out).rot)
     assert made.card is None and made.keyframes == keys and "<svg" in made._repr_html_()
-    np.testing.assert_allclose(made.clip.rot[20], poise.read(WALK).rot[20])
+    np.testing.assert_allclose(made.clip.rot[20], poise.read(walk).rot[20])
     assert set(made.save(tmp_path / "all")) == {"filled"}
 
 
