@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv, RewardTerm
+from poise.env import ImitationEnv, RewardTerm, evaluate
 from poise.env.evaluate import MANY, record
 from poise.env.frame import Frame, LazyPose
 from poise.motion.rotations import (
@@ -168,6 +168,34 @@ def test_recorded_terms_give_what_the_plain_ones_give(make_task):
     recorded = fused._terms._recorded
     assert sorted(recorded) == ["judge", "observe"] and not plain._terms._recorded
     assert recorded["judge"] != fused._terms.evaluated and recorded["observe"] != fused._terms._observe
+
+
+def test_it_changes_no_bit_when_terms_are_recorded(make_task, monkeypatch):
+    """At the first step, after some, in real time at once, or never."""
+    task, made, runs = make_task(*CLIPS, num_envs=20, horizon=9), [], []
+    monkeypatch.setattr(evaluate, "record", lambda *x: made.append(1) or record(*x))
+    for often, soon, recordings in ((1, False, True), (7, False, True), (10**9, True, True),
+                                    (10**9, False, False)):  # fmt: skip
+        monkeypatch.setattr(evaluate, "OFTEN", often)
+        made.clear()
+        env = ImitationEnv(task.reference, CpuBackend(task.model, 20, 1), task.task, 2, 5)
+        if soon:
+            env.record_at_once()
+        run = [env.reset().clone()]
+        for t in range(15):
+            step = env.step(actions(env, t))
+            run += [
+                step.obs.clone(),
+                step.reward,
+                step.terminated,
+                step.truncated,
+                step.final_obs.clone(),
+            ]
+        assert bool(made) == recordings
+        runs.append(run)
+        env.close()
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
 
 
 def test_a_task_may_have_observations_alone(make_task):

@@ -169,7 +169,8 @@ class ImitationEnv:
         task: the terms, and what the environment holds beside them (`env.task`).
         substeps: physics steps of a control step.
         weights: `(C,)` odds with which clips are drawn, see `Starts`.
-        fused: terms are recorded once and replayed as a whole, see `Terms`; off, one by one.
+        fused: terms that are often evaluated are recorded and replayed as a whole, see `Terms`; off, one
+            by one.
 
     Attributes:
         goal, task, backend: as given.
@@ -441,6 +442,11 @@ class ImitationEnv:
         """Observations `(N, O)` of the worlds as they stand, after the goal has looked at them."""
         self._watched()
         return self._observe()
+
+    def record_at_once(self) -> None:
+        """Terms are recorded when they are next evaluated, for real time: a later step would
+        take the time of fifty."""
+        self._terms.record_at_once()
 
     def pose(self) -> Pose:
         """The simulated characters now."""
