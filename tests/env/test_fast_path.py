@@ -165,9 +165,6 @@ def test_recorded_terms_give_what_the_plain_ones_give(make_task):
             torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-6, rtol=1e-6)
         assert a.log == pytest.approx(b.log, abs=1e-6)
     assert torch.equal(fused.backend.state.qpos, plain.backend.state.qpos)
-    recorded = fused._terms._recorded
-    assert sorted(recorded) == ["judge", "observe"] and not plain._terms._recorded
-    assert recorded["judge"] != fused._terms.evaluated and recorded["observe"] != fused._terms._observe
 
 
 def test_it_changes_no_bit_when_terms_are_recorded(make_task, monkeypatch):
@@ -191,7 +188,8 @@ def test_it_changes_no_bit_when_terms_are_recorded(make_task, monkeypatch):
                 step.truncated,
                 step.final_obs.clone(),
             ]
-        assert bool(made) == recordings
+        # What is observed, and what is judged.
+        assert len(made) == 2 * recordings
         runs.append(run)
         env.close()
     for run in runs[1:]:

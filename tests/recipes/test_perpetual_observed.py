@@ -103,7 +103,7 @@ def test_all_headings_of_an_environment_are_those_of_the_hips() -> None:
     # A clip is seen as a character that does it: what a motion prior sees of both is the same.
     env.reset_to(HERE, HERE * 2)
     row = env.reference.rows(HERE, HERE * 2)
-    seen = seen_by(env._terms.style, env.view())
+    seen = seen_by(env.task.style, env.view())
     torch.testing.assert_close(env._clip_features(row), seen, atol=2e-4, rtol=1e-3)
     env.close()
 
