@@ -444,9 +444,13 @@ class ImitationEnv:
         return self._observe()
 
     def record_at_once(self) -> None:
-        """Terms are recorded when they are next evaluated, for real time: a later step would
-        take the time of fifty."""
+        """Terms are recorded now, for what steps in real time: a later step would take the time of fifty."""
         self._terms.record_at_once()
+        told = self._sources.of(self._told())
+        # A recording is made at the first call, and made fast at the second.
+        for _ in range(2):
+            self._terms.observe(told)
+            self._terms.judge(told)
 
     def pose(self) -> Pose:
         """The simulated characters now."""
