@@ -444,7 +444,7 @@ class ImitationEnv:
         return self._observe()
 
     def record_at_once(self) -> None:
-        """Terms are recorded now, for what steps in real time: a later step would take the time of fifty."""
+        """Terms are recorded now, for real time: else a later step takes the time of fifty."""
         self._terms.record_at_once()
         told = self._sources.of(self._told())
         # A recording is made at the first call, and made fast at the second.
