@@ -86,7 +86,7 @@ class Adam:
         (b1, b2), decay = self.betas, group["weight_decay"]
         kernel = torch._fused_adamw_ if decay > 0 else torch._fused_adam_
         own = {"lr": group["lr"], "beta1": b1, "beta2": b2, "weight_decay": decay, "eps": self.eps}
-        grads = [p.grad for p in params]
+        grads = [p.grad for p in params if p.grad is not None]
         kernel(params, grads, first, second, [], steps, amsgrad=False, maximize=False, **own)
 
     def _each(self, params: list[Tensor], group: Mapping[str, Any]) -> None:
