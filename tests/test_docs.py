@@ -40,6 +40,7 @@ _SHORTER = (
     ("minutes=3", "iterations=1, num_envs=16, expert=False"),
     ("poise.track(clip)", 'poise.track(clip, controller="policy")'),
     ("direction=asked", 'direction=asked, controller="policy"'),
+    ("(0, 20, 40)", "(0, 20, 40), adapt=0"),
     ("stiffness=200.0)", 'stiffness=200.0, config=poise.TrackConfig(controller="policy"))'),
 )
 #: Frames of the clips that snippets read; one of them names frame 40.

@@ -15,6 +15,7 @@ import pytest
 import poise
 from poise.cli.main import main
 from poise.motion import trim
+from poise.plan import LookaheadConfig
 from poise.recipes import build
 from refusals import refused
 from toy_human import swing
@@ -51,14 +52,14 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def imitated(clip: Path) -> poise.Result:
-    return poise.imitate(str(clip), iterations=2, threads=1, num_envs=16)
+    return poise.imitate(str(clip), iterations=2, threads=1, num_envs=16, expert=False)
 
 
 def test_imitate_gives_the_numbers_of_the_command(
     clip: Path, imitated: poise.Result, tmp_path: Path
 ) -> None:
     out = tmp_path / "cli"
-    small = ["--iterations", "2", "--envs", "16", "--threads", "1"]
+    small = ["--iterations", "2", "--envs", "16", "--threads", "1", "--no-expert"]
     assert main(["imitate", str(clip), "-o", str(out), *small]) == 0
     said = json.loads((out / "score.json").read_text())
     assert figures(imitated.card) == figures(said)
@@ -114,8 +115,8 @@ def test_a_folder_is_gone_on_with(tmp_path: Path) -> None:
 def test_track_gives_the_numbers_of_the_command(tmp_path: Path) -> None:
     short = tmp_path / "walk.bvh"
     poise.write(trim(poise.read(WALK), 0, 20), short)
-    tracked = poise.track(short)
-    assert main(["track", str(short), "-o", str(tmp_path / "out")]) == 0
+    tracked = poise.track(short, lookahead=LookaheadConfig().with_budget(30.0))
+    assert main(["track", str(short), "-o", str(tmp_path / "out"), "--budget", "30"]) == 0
     said = json.loads((tmp_path / "out/score.json").read_text())
     assert figures(tracked.card) == figures(said)
     written = poise.read(tmp_path / "out/simulated.bvh")
@@ -126,14 +127,15 @@ def test_track_gives_the_numbers_of_the_command(tmp_path: Path) -> None:
 
 
 def test_inbetween_gives_the_frames_of_the_command(tmp_path: Path) -> None:
-    keys, out = (0, 20, 41), tmp_path / "out.bvh"
-    made = poise.inbetween(WALK, keys, adapt=2)
+    keys, out, walk = (0, 20, 41), tmp_path / "out.bvh", tmp_path / "walk.bvh"
+    poise.write(trim(poise.read(WALK), 0, 44), walk)
+    made = poise.inbetween(walk, keys, adapt=2)
     command = ["--keyframes", "0,20,41", "--adapt", "2", "-o", str(out)]
-    assert main(["inbetween", str(WALK), *command]) == 0
+    assert main(["inbetween", str(walk), *command]) == 0
     made.save(tmp_path / "mine.bvh")
     np.testing.assert_array_equal(poise.read(tmp_path / "mine.bvh").rot, poise.read(out).rot)
     assert made.card is None and made.keyframes == keys and "<svg" in made._repr_html_()
-    np.testing.assert_allclose(made.clip.rot[20], poise.read(WALK).rot[20])
+    np.testing.assert_allclose(made.clip.rot[20], poise.read(walk).rot[20])
     assert set(made.save(tmp_path / "all")) == {"filled"}
 
 

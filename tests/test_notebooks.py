@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from sparing import spare
+
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 #: What a notebook needs beside Poise.
@@ -37,6 +39,7 @@ def test_notebooks_run(notebook: Path, tmp_path: Path, monkeypatch: pytest.Monke
     for module in NEEDS.get(notebook.name, ()):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
+    spare(monkeypatch)
     names = {"__name__": "notebook"}
     with torch.random.fork_rng():
         for number, code in enumerate(_cells(notebook)):

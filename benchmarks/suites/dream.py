@@ -23,6 +23,7 @@ from benchmarks.common.clips import Places, library, moment
 from benchmarks.common.rows import Figure, mean_of, of
 from benchmarks.common.runner import Part, Raws
 from benchmarks.common.starts import Nothing
+from benchmarks.suites.lookahead_search import SMALL
 from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
 from poise.env.generator_goal import GeneratorGoal, Steering
@@ -262,9 +263,9 @@ def together(places: Places, unit: str, name: str) -> Any:
 
 def ahead(places: Places, unit: str) -> Any:
     """A rollout that looks ahead."""
-    seconds = 1.0 if places.smoke else 60.0
+    seconds, how = (1.0, {"lookahead": SMALL}) if places.smoke else (60.0, {})
     tracker, model, _ = loaded()
-    done = dream(seconds, model, tracker, seed=int(unit.removeprefix("seed ")), threads=1)
+    done = dream(seconds, model, tracker, seed=int(unit.removeprefix("seed ")), threads=1, **how)
     one = done.characters[0]
     made = Rollouts(
         one.done.read()[None],

@@ -214,6 +214,7 @@ def thread_counts() -> list[int]:
 
 def _row(imitation: Imitation, n: int, threads: int, steps: int, repeats: int) -> dict[str, Any]:
     env = imitation.env(n, threads=threads)
+    env.record_at_once()
     raw, rates, limits = Raw(env, threads), [], []
     env.reset()
     actions = exploring(imitation, env, steps)
@@ -251,6 +252,7 @@ def bench_latency(
     """
     task = imitation.bare(groups=True)
     env = task.env(1, 0, False, 1, help_scale=1.0 if helped else 0.0, guard=False)
+    env.record_at_once()
     if policy is None:
         trainer = imitation.trainer(threads=1)
         policy = trainer.policy()
@@ -605,6 +607,7 @@ def crowd(places: Places, unit: str) -> Any:
     task = side_by_side(task, count) if count > 1 else task
     backend = in_one_world(task.humanoid, task.config.sim, count)
     env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=backend)
+    env.record_at_once()
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     clip, zero = torch.arange(count), torch.zeros(count, dtype=torch.long)

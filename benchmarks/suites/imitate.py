@@ -27,6 +27,7 @@ from benchmarks.common.field import figures as tracked_figures
 from benchmarks.common.field import measured
 from benchmarks.common.rows import Figure, between, mean_of, of
 from benchmarks.common.runner import Part, Raws
+from benchmarks.suites.lookahead_search import SMALL
 from poise.errors import PoiseError
 from poise.jobs.imitate import imitate
 from poise.jobs.open import open_run
@@ -77,9 +78,10 @@ def imitated(places: Places, unit: str) -> Any:
     began = time.perf_counter()
     clip = single(places, name)
     config = TrackConfig(body="own", threads=1, seed=int(seed))
+    config = replace(config, lookahead=SMALL) if places.smoke else config
     first = track(clip, config=config)
     seen = time.perf_counter() - began
-    minutes = 0.05 if places.smoke else MINUTES
+    minutes = 0.02 if places.smoke else MINUTES
     with tempfile.TemporaryDirectory() as folder:
         try:
             card = imitate(clip, minutes, folder=folder, threads=1, seed=int(seed)).card

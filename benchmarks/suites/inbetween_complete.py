@@ -25,6 +25,7 @@ from torch import Tensor
 from benchmarks.common.clips import RFC, WALK, Places
 from benchmarks.common.rows import Figure, mean_of, of
 from benchmarks.common.runner import Part, Raws
+from benchmarks.suites.lookahead_search import SMALL
 from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.own import unpack_clips
@@ -493,9 +494,9 @@ def completed(places: Places, unit: str) -> Any:
     clip = trim(clip, 0, min(clip.frames, round((1.5 if places.smoke else SECONDS) * clip.fps)) - 1)
     keys = [*range(0, clip.frames - round(0.5 * clip.fps), round(clip.fps)), clip.frames - 1]
     times = None if share == 1.0 else [share * k / clip.fps for k in keys]
-    begun = time.process_time()
+    begun, how = time.process_time(), {"lookahead": SMALL, "adapt": 0} if places.smoke else {}
     done = complete(
-        clip, keys, open_run(None).tracker, threads=1, supports="none", retime=retime, times=times
+        clip, keys, open_run(None).tracker, threads=1, supports="none", retime=retime, times=times, **how
     )
     made = done.filled.clips[0].positions()[list(done.at)]
     # The null: what the body is from its keyframes if it stays on the first one.

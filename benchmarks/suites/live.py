@@ -375,7 +375,7 @@ def people(places: Places, count: int = 4) -> list[Clip]:
 def endured(places: Places, unit: str) -> Any:
     """Four people for fifty minutes; one character looks ahead."""
     clips = [moment()] * 4 if places.smoke else people(places)
-    return endure(clips, 0.15 if places.smoke else 50.0, int(unit.removeprefix("seed ")), places.smoke)
+    return endure(clips, 0.12 if places.smoke else 50.0, int(unit.removeprefix("seed ")), places.smoke)
 
 
 def endured_rows(places: Places, raws: Raws) -> Iterator[Figure]:
@@ -402,7 +402,7 @@ def idle(places: Places, unit: str) -> Any:
     """A server to which nobody sends: its rate and memory."""
     process, host = serve("--characters", "1")
     try:
-        seen = asyncio.run(watch(f"ws://{host}/live", 6.0 if places.smoke else 60.0))
+        seen = asyncio.run(watch(f"ws://{host}/live", 3.0 if places.smoke else 60.0))
         figures = [f for f in seen if "characters" in f]
         memory = memory_mb(process.pid)
     finally:
@@ -437,7 +437,7 @@ def dreamt(places: Places, unit: str) -> Any:
         os.sched_setaffinity(0, every)
     try:
         seen = asyncio.run(
-            watched(host, n, 2.0 if places.smoke else 180.0, 5.0 if places.smoke else WARMS_S)
+            watched(host, n, 2.0 if places.smoke else 180.0, 1.0 if places.smoke else WARMS_S)
         )
     finally:
         process.terminate()

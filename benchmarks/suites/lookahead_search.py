@@ -162,7 +162,7 @@ def followed(
         clean = imitation_of(tracker, [place(motion, tracker)])
     except PoiseError as problem:
         return {"refused": problem.what, "episodes": []}
-    for k in trials:
+    for k in trials[:2] if places.smoke else trials:
         task = clean
         if wrong.noise:
             task = imitation_of(tracker, [place(disturbed(motion, wrong, seed + k), tracker)])
@@ -350,6 +350,12 @@ def wrong_part(name: str) -> Part:
     )
 
 
+def drawn(places: Places, unit: str, of_set: str) -> Any:
+    """One clip by lookahead with the draws of a seed."""
+    clip, _, seed = unit.rpartition(", seed ")
+    return followed(places, clip, of_set, "lookahead", (0,), 1000 * int(seed))
+
+
 def draws_part(name: str, title: str, every: int, seeds: tuple[int, ...], hours: float) -> Part:
     """The same with other draws of lookahead."""
 
@@ -360,15 +366,11 @@ def draws_part(name: str, title: str, every: int, seeds: tuple[int, ...], hours:
             for c in _units(places, name, every)
         ]
 
-    def measure(places: Places, unit: str) -> Any:
-        clip, _, seed = unit.rpartition(", seed ")
-        return followed(places, clip, name, "lookahead", (0,), 1000 * int(seed))
-
     needs = ("data",) if SETS[name].pattern else ("library",)
     return Part(
         f"{title}; other draws",
         units,
-        measure,
+        partial(drawn, of_set=name),
         partial(draws, subject=f"{title}; lookahead, other draws"),
         ("tracker",),
         hours=hours,

@@ -56,13 +56,13 @@ def units(places: Places, name: str) -> list[str]:
     return list(chunks(names_of(places, name), AT_ONCE))
 
 
-def episodes_of(places: Places, unit: str, name: str, method: str, trials: tuple[int, ...]) -> Any:
+def episodes_of(places: Places, unit: str, of_set: str, method: str, trials: tuple[int, ...]) -> Any:
     """One group by one method; clips that no body can be set on are told."""
     kind, acts = METHODS[method]
     tracker, usable, refused = policy_of(kind), [], {}
-    for clip in chunks(names_of(places, name), AT_ONCE)[unit]:
+    for clip in chunks(names_of(places, of_set), AT_ONCE)[unit]:
         try:
-            usable.append(place(clip_of(places, name, clip), tracker))
+            usable.append(place(clip_of(places, of_set, clip), tracker))
         except PoiseError as problem:
             refused[clip] = problem.what
     if not usable:
@@ -86,7 +86,7 @@ def set_part(name: str, method: str, trials: tuple[int, ...], hours: float) -> P
     needs = ("data",) if SETS[name].pattern else ("library",)
     return Part(
         f"{SETS[name].title}, {SETS[name].learned}", partial(units, name=name),
-        partial(episodes_of, name=name, method=method, trials=trials),
+        partial(episodes_of, of_set=name, method=method, trials=trials),
         partial(set_rows, name=name, method=method), (METHODS[method][0],), hours=hours, needs=needs
     )  # fmt: skip
 

@@ -11,6 +11,7 @@ from benchmarks.__main__ import arguments, main
 from benchmarks.common.clips import Places
 from benchmarks.common.rows import read
 from benchmarks.common.runner import SUITES, missing, parts_of
+from sparing import spare
 
 #: A word of the subject of the rows in which nothing acts.
 NULLS = {
@@ -34,7 +35,10 @@ NULLS = {
 @pytest.mark.benchmarks
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("suite", SUITES)
-def test_a_moment_of_each_part_makes_rows(suite: str, tmp_path: Path) -> None:
+def test_a_moment_of_each_part_makes_rows(
+    suite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spare(monkeypatch)
     assert main([suite, "--smoke", "--work", str(tmp_path), "--data", str(tmp_path / "none")]) == 0
     rows = read(tmp_path / "smoke" / f"{suite}.csv")
     places = Places(tmp_path, tmp_path, tmp_path, True)

@@ -14,6 +14,7 @@ import pytest
 from tiny_clips import MINIATURE
 
 import poise
+from poise.cli import demo
 from poise.cli.console import Answer, document
 from poise.cli.main import VERBS, main
 from poise.cli.parse import options_of
@@ -21,6 +22,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.motion import trim
 from poise.settings import plain
+from sparing import spare
 from toy_policy import WALK, toy_run
 
 #: No lookahead.
@@ -84,7 +86,9 @@ def test_every_verb_answers_in_one_schema(
     verb: str, short: Path, clip: Path, trained: Path, tmp_path: Path, answered: Callable[..., Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr("poise.cli.demo.WALK", short)
+    values = [short if value == demo.WALK else value for value in demo.run.__defaults__ or ()]
+    monkeypatch.setattr(demo.run, "__defaults__", tuple(values))
+    spare(monkeypatch)
     argv, code = lines(verb, short, clip, trained, tmp_path)
     found = answered(verb, *argv, code=code)
     check(found)

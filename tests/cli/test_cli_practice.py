@@ -15,11 +15,10 @@ from poise.cli.main import main
 from poise.formats import read_clip, write_clip
 from poise.jobs import practice
 from poise.jobs.open import open_run
-from poise.jobs.track import TrackConfig
 from poise.motion import trim
-from poise.plan import LookaheadConfig, SamplingConfig
 from poise.score.card import Help
 from refusals import refused
+from sparing import spare
 from toy_policy import WALK, toy_run
 
 
@@ -39,9 +38,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A motion is looked for by few characters."""
-    few = {"lookahead": LookaheadConfig(10, 4), "search": SamplingConfig(8, retries=0)}
-    monkeypatch.setattr(practice, "TrackConfig", lambda **how: TrackConfig(**how, **few))
+    """A motion is looked for by few characters, and learned in few worlds."""
+    spare(monkeypatch)
     monkeypatch.setattr(practice, "help_wanted", lambda *_: 200.0)
 
 
@@ -84,7 +82,8 @@ def test_a_policy_learns_the_clip_and_goes_on(
 
 
 def test_python_does_the_same(run: Path, short: Path, tmp_path: Path) -> None:
-    made = poise.imitate(short, policy=run, iterations=1, threads=1)
+    brief = trim(read_clip(short), 0, 20)
+    made = poise.imitate(brief, policy=run, iterations=1, threads=1)
     assert made.card.method.startswith("perpetual-single")
     assert made.clip.skeleton.names == read_clip(short).skeleton.names
     paths = made.save(tmp_path / "made")

@@ -15,7 +15,7 @@ from poise.cli.console import LOST
 from poise.cli.main import main
 from poise.formats import read_clip, write_clip
 from poise.jobs.open import open_run
-from poise.jobs.track import tracking
+from poise.jobs.track import learning, tracking
 from poise.kinematics import sole_slide
 from poise.motion import shifted, trim
 from toy_policy import WALK, toy_run
@@ -66,8 +66,13 @@ def test_motion_score_and_report(
 
 
 def test_a_motion_that_is_lost_is_learned(
-    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    file: Path,
+    short: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(learning, "WORLDS", 32)
     out = tmp_path / "made.bvh"
     argv = [
         "track",
@@ -134,7 +139,7 @@ def test_by_default_it_looks_ahead(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["track", str(short), "--policy", str(file), "--characters", "8", "--threads", "1"]
-    code = main([*argv, "-o", str(tmp_path / "a"), "--budget", "60", "--seed", "1"])
+    code = main([*argv, "-o", str(tmp_path / "a"), "--budget", "30", "--seed", "1"])
     said = capsys.readouterr()
     assert "looking ahead, 0 % done" in said.err
     score = json.loads((tmp_path / "a/score.json").read_text())
@@ -147,7 +152,7 @@ def test_by_default_it_looks_ahead(
     code = main([*argv, "-o", str(tmp_path / "b"), "--controller", "lookahead", "--budget", "30"])
     assert code == 0 or "--controller auto" in capsys.readouterr().out
     # Again the same.
-    main([*argv, "-o", str(tmp_path / "c"), "--budget", "60", "--seed", "1"])
+    main([*argv, "-o", str(tmp_path / "c"), "--budget", "30", "--seed", "1"])
     again = json.loads((tmp_path / "c/score.json").read_text())
     assert again["mpjpe_mm"] == score["mpjpe_mm"]
     for wrong, words in (("3", "at least 10 candidates"), ("0", "--budget must lie in")):

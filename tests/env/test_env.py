@@ -35,7 +35,7 @@ def test_a_start_lies_exactly_on_the_reference(make_env):
     assert torch.equal(state.qpos, env.reference.qpos[rows])
     assert torch.equal(state.qvel, env.reference.qvel[rows])
     assert len(env.frame.unique()) > 4 and int(env.frame.max()) < int(env.reference.length[0]) - 1
-    view = env._frame()
+    view = env.view()
     for term in env.task.rewards:
         torch.testing.assert_close(term.fn(view, **term.params), torch.ones(16), atol=1e-3, rtol=0)
     for name in ("pos", "quat", "linvel", "angvel", "com", "heading"):
@@ -162,7 +162,7 @@ def test_observations_do_not_know_where_in_the_world(make_env):
     env.reset()
     for t in range(3):
         env.step(actions(env, seed=t))
-    before = env._observe()
+    before = env.observe()
     # The whole world turns: the simulated characters and the reference alike.
     yaw, move = torch.tensor(1.9, dtype=torch.float64), torch.tensor([6.0, -3.0, 0.0]).double()
     q = axis_angle_to_quat(torch.tensor([0.0, 0, 1]).double(), yaw)
@@ -181,7 +181,7 @@ def test_observations_do_not_know_where_in_the_world(make_env):
     env.goal.clips.reset(None, env.clip, env.frame)
     env.goal.aim(None, None)
     env.backend.write(None, *carried(env.backend.state.qpos, env.backend.state.qvel))
-    torch.testing.assert_close(env._observe(), before, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(env.observe(), before, atol=1e-4, rtol=1e-4)
     env.close()
 
 

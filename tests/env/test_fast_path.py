@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv, RewardTerm
+from poise.env import ImitationEnv, RewardTerm, evaluate
 from poise.env.evaluate import MANY, record
 from poise.env.frame import Frame, LazyPose
 from poise.motion.rotations import (
@@ -105,7 +105,7 @@ def test_the_fused_step_equals_the_plain_one(make_env, settings):
         over = step.terminated | step.truncated
         ended += int(over.sum())
         # Whether a world goes on or has just begun anew, it is seen as from nothing.
-        torch.testing.assert_close(step.obs, env._observe(), atol=2e-6, rtol=2e-6)
+        torch.testing.assert_close(step.obs, env.observe(), atol=2e-6, rtol=2e-6)
         plain = plain_observation(env)
         torch.testing.assert_close(step.obs, plain.float(), atol=2e-5, rtol=2e-5)
         assert torch.equal(step.obs[~over], step.final_obs[~over])
@@ -165,9 +165,35 @@ def test_recorded_terms_give_what_the_plain_ones_give(make_task):
             torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-6, rtol=1e-6)
         assert a.log == pytest.approx(b.log, abs=1e-6)
     assert torch.equal(fused.backend.state.qpos, plain.backend.state.qpos)
-    recorded = fused._terms._recorded
-    assert sorted(recorded) == ["judge", "observe"] and not plain._terms._recorded
-    assert recorded["judge"] != fused._terms.evaluated and recorded["observe"] != fused._terms._observe
+
+
+def test_it_changes_no_bit_when_terms_are_recorded(make_task, monkeypatch):
+    """At the first step, after some, in real time at once, or never."""
+    task, made, runs = make_task(*CLIPS, num_envs=20, horizon=9), [], []
+    monkeypatch.setattr(evaluate, "record", lambda *x: made.append(1) or record(*x))
+    for often, soon, recordings in ((1, False, True), (7, False, True), (10**9, True, True),
+                                    (10**9, False, False)):  # fmt: skip
+        monkeypatch.setattr(evaluate, "OFTEN", often)
+        made.clear()
+        env = ImitationEnv(task.reference, CpuBackend(task.model, 20, 1), task.task, 2, 5)
+        if soon:
+            env.record_at_once()
+        run = [env.reset().clone()]
+        for t in range(15):
+            step = env.step(actions(env, t))
+            run += [
+                step.obs.clone(),
+                step.reward,
+                step.terminated,
+                step.truncated,
+                step.final_obs.clone(),
+            ]
+        # What is observed, and what is judged.
+        assert len(made) == 2 * recordings
+        runs.append(run)
+        env.close()
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
 
 
 def test_a_task_may_have_observations_alone(make_task):

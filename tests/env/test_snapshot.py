@@ -23,7 +23,7 @@ from refusals import refused
 from toy_human import swing
 from toy_library import PLAIN, library, lively, tiny
 
-STEPS = 50
+STEPS = 30
 CLIPS = (swing(0.7, name="calm"), swing(0.6, speed=2.0, name="quick"))
 
 

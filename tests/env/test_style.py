@@ -38,7 +38,7 @@ def test_windows_of_the_same_motion_are_the_same(task):
     seen = []
     for t in range(frames):
         env.reset_to(clip, first + t)
-        seen.append(seen_by(env._terms.style, env._frame()))
+        seen.append(seen_by(env.task.style, env.view()))
     window = env.demos(frames).at(clip, first)
     assert window.shape == (3, frames * env.num_features)
     # The last one goes on into the clip's next cycle, turned and carried on.
@@ -55,7 +55,7 @@ def test_features_are_of_what_the_step_reached_before_restarts(task):
         a = act(env, t) + 0.1 * (t % 4 == 3)
         step, reached = env.step(a), still.step(a)
         assert torch.equal(env.features(), still.features())
-        plain = seen_by(still._terms.style, still._frame())
+        plain = seen_by(still.task.style, still.view())
         torch.testing.assert_close(still.features(), plain, atol=1e-5, rtol=1e-5)
         assert torch.equal(step.final_obs, reached.final_obs)
         restarted += int((step.terminated | step.truncated).sum())
@@ -73,11 +73,11 @@ def test_the_past_of_a_start_is_that_of_its_clip(task):
     assert past is not None and past.shape == (4, count, env.num_features)
     # Rows 1 and 3 begin too early in clips that do not go on.
     assert past.isnan().all((1, 2)).tolist() == [True, False, True, False]
-    now = seen_by(env._terms.style, env._frame())
+    now = seen_by(env.task.style, env.view())
     torch.testing.assert_close(past[1, -1], now[0], atol=1e-4, rtol=1e-4)
     ref = env.reference
     # Worked out from the frames that are asked for, in place of a table of all frames.
-    plain = ClipFeatures(ref, env._terms.style, most_bytes=0)
+    plain = ClipFeatures(ref, env.task.style, most_bytes=0)
     want = plain(int(ref.start[0]) + torch.arange(2, 8))
     assert plain._all is None and env._clip_features._all is not None
     torch.testing.assert_close(past[1], want, atol=1e-6, rtol=1e-6)
@@ -151,7 +151,7 @@ def test_torques_are_those_of_the_servos_and_the_damping(task):
     speed = backend.state.qvel[:, 6:]
     # tau = clip(kp (u - q)) - kd q'
     torque = torch.clip(kp * (u - q), -most, most) - torch.tensor(model.dof_damping[6:]) * speed
-    frame = env._frame()
+    frame = env.view()
     assert frame.torque is not None
     torch.testing.assert_close(frame.torque, torque.float(), atol=1e-3, rtol=1e-4)
     power = (torque * speed).abs().sum(-1).float()

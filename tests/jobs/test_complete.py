@@ -30,7 +30,7 @@ from refusals import refused
 from toy_human import swing, trembling
 from toy_policy import walk
 
-FEW = LookaheadConfig(candidates=12, smoothing=(0.0, 0.5))
+FEW = LookaheadConfig(candidates=10, horizon=6, smoothing=(0.0, 0.5))
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from refusals import refused
 from toy_policy import walk
 
 SMALL = CVAEConfig(past=10, future=12, latent=4, hidden=32, layers=(32,))
-FEW = LookaheadConfig(candidates=12, smoothing=(0.0, 0.5))
+FEW = LookaheadConfig(candidates=10, horizon=6, smoothing=(0.0, 0.5))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def tracker() -> Tracker:
 @pytest.fixture(scope="module")
 def model(tracker: Tracker, tmp_path_factory: pytest.TempPathFactory) -> GeneratorModel:
     motions = motions_of(ClipLibrary.of([walk()]), tracker, SMALL, lambda _: None)
-    config = Endless(SMALL, CVAETraining(batch=16), steps=200, ema=0.9)
+    config = Endless(SMALL, CVAETraining(batch=16), steps=60, ema=0.9)
     return train_generator(motions, tmp_path_factory.mktemp("run"), config)[0]
 
 

@@ -104,7 +104,15 @@ def test_a_run_stopped_at_each_boundary_goes_on(whole: Path, tmp_path: Path) -> 
     assert_same(whole, tmp_path)
 
 
-def test_a_killed_run_goes_on_from_an_older_checkpoint(whole: Path, tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_from_an_older_checkpoint(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        # While it clones, before anything is saved: it begins again.
+        patch.setattr(StageTrainer, "save", lambda self: (_ for _ in ()).throw(KilledError()))
+        with pytest.raises(KilledError):
+            go_on(tmp_path)
+    assert not (tmp_path / LATEST).exists()
     for moment in (3, 9, 13):
         # Nothing but evaluations saves, so that some iterations are lost and made again.
         with pytest.raises(KilledError):
@@ -113,38 +121,33 @@ def test_a_killed_run_goes_on_from_an_older_checkpoint(whole: Path, tmp_path: Pa
     assert_same(whole, tmp_path)
 
 
-@pytest.mark.parametrize("step", ["next", "trainer"])
 def test_a_run_killed_between_any_two_stages_ends_the_stage_again(
-    whole: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain, died = getattr(PrimitiveOrder, step), set()
+    """Before the next stage is chosen, and before its trainer is made."""
+    died = set()
 
-    def dying(*args: object, **more: object) -> object:
-        stage = next(x for x in args if isinstance(x, Stage))
-        if stage.number > 1 and stage not in died:
-            died.add(stage)
-            raise KilledError
-        return plain(*args, **more)
+    def dying(step: str) -> Callable[..., object]:
+        plain = getattr(PrimitiveOrder, step)
 
-    monkeypatch.setattr(PrimitiveOrder, step, dying)
-    for _ in STAGES[1:]:
+        def die(*args: object, **more: object) -> object:
+            stage = next(x for x in args if isinstance(x, Stage))
+            if stage.number > 1 and (step, stage) not in died:
+                died.add((step, stage))
+                raise KilledError
+            return plain(*args, **more)
+
+        return die
+
+    for step in ("next", "trainer"):
+        monkeypatch.setattr(PrimitiveOrder, step, dying(step))
+    for _ in range(2 * len(STAGES[1:])):
         with pytest.raises(KilledError):
             go_on(tmp_path)
     go_on(tmp_path)
-    assert [s.name for s in sorted(died, key=lambda s: s.number)] == STAGES[1:]
-    assert_same(whole, tmp_path)
-
-
-def test_a_run_killed_while_it_clones_begins_again(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plain = StageTrainer.save
-    monkeypatch.setattr(StageTrainer, "save", lambda self: (_ for _ in ()).throw(KilledError()))
-    with pytest.raises(KilledError):
-        go_on(tmp_path)
-    assert not (tmp_path / LATEST).exists()
-    monkeypatch.setattr(StageTrainer, "save", plain)
-    go_on(tmp_path)
+    for step in ("next", "trainer"):
+        stages = sorted((s for at, s in died if at == step), key=lambda s: s.number)
+        assert [s.name for s in stages] == STAGES[1:]
     assert_same(whole, tmp_path)
 
 

@@ -33,7 +33,7 @@ trained(Path(sys.argv[1]), {iterations})
 def trained(folder: Path, iterations: int) -> None:
     small = {"policy_hidden": (16,), "value_hidden": (16,)}
     ppo = PPOConfig(horizon=4, minibatch=32, epochs=2, norm_warmup=2, **small)
-    config = ResidualForce(num_envs=16, ppo=ppo, seed=3)
+    config = ResidualForce(num_envs=16, ppo=ppo, seed=3, expert=False)
     imitation = begin(folder, ClipLibrary.of(swing(1.0)), config)
     train(imitation, folder, Until(iterations=iterations), threads=1, tensorboard=False)
 

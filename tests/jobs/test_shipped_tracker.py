@@ -19,6 +19,7 @@ from poise.jobs.result import shortfalls
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import POLICIES, SHIPPED, Tracker
+from poise.motion import trim
 from poise.score.recovered import KINDS
 from toy_human import human, swing, turn
 from toy_policy import WALK
@@ -80,7 +81,8 @@ def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
 
 
 def test_a_held_out_take_is_followed_for_a_while(tracker: Tracker, data_dir: Path) -> None:
-    tracked = track(read_clip(data_dir / "cmu_bvh/ad/14_14.bvh"), tracker, controller="policy")
+    clip = read_clip(data_dir / "cmu_bvh/ad/14_14.bvh")
+    tracked = track(trim(clip, 0, round(5 * clip.fps)), tracker, controller="policy")
     assert not tracked.failures or tracked.failures[0][1] > 1.0
 
 

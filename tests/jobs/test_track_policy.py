@@ -133,12 +133,15 @@ def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
         _ = open_run(tmp_path).tracker
 
 
-def test_a_program_that_only_tracks_starts_without_heavy_packages(file: Path) -> None:
+def test_a_program_that_tracks_or_learns_starts_without_heavy_packages(file: Path) -> None:
     """They would take longer to import than the policy takes to open."""
     code = (
         "import sys; from pathlib import Path; import poise.jobs.track; "
         "from poise.jobs.open import open_run; _ = open_run(Path(sys.argv[1])).tracker; "
-        "print([m for m in ('sympy', 'scipy.optimize', 'scipy.spatial') if m in sys.modules])"
+        "import torch; from poise.learn.adam import Adam; p = torch.nn.Parameter(torch.ones(2)); "
+        "p.grad = torch.ones(2); Adam([p]).step(); "
+        "heavy = ('sympy', 'torch._dynamo', 'scipy.optimize', 'scipy.spatial'); "
+        "print([m for m in heavy if m in sys.modules])"
     )
     command = [sys.executable, "-c", code, str(file)]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"

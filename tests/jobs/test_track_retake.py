@@ -26,7 +26,7 @@ from poise.plan import LookaheadConfig
 from refusals import refused
 from toy_policy import walk
 
-FEW = LookaheadConfig(candidates=12, smoothing=(0.0, 0.5))
+FEW = LookaheadConfig(candidates=10, horizon=6, smoothing=(0.0, 0.5))
 HOW = {"lookahead": FEW, "threads": 1, "supports": "none"}
 
 
@@ -37,7 +37,7 @@ def tracker() -> Tracker:
 
 @pytest.fixture(scope="module")
 def clip() -> Clip:
-    return walk()
+    return walk(0, 72)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def earlier(tracker: Tracker, clip: Clip) -> Result:
 
 
 def test_only_the_part_changes(tracker: Tracker, clip: Clip) -> None:
-    how = HOW | {"lookahead": replace(FEW, candidates=24)}
+    how = HOW | {"lookahead": replace(FEW, candidates=16)}
     earlier = track(clip, tracker, **how)
     assert earlier.simulation is not None
     asked = Retake(earlier.simulation, 0.3, 0.6)
@@ -164,7 +164,7 @@ def test_damaged_files_are_refused(earlier: Result, tmp_path: Path) -> None:
 def test_the_command_line_does_the_same(clip: Clip, tmp_path: Path, capsys) -> None:
     file = tmp_path / "walk.bvh"
     write_clip(clip, file)
-    quick = ["--budget", "60", "--threads", "1", "--json"]
+    quick = ["--budget", "30", "--threads", "1", "--json"]
     assert main(["track", str(file), "-o", str(tmp_path / "one"), *quick]) == 0
     capsys.readouterr()
     part = ["--range", "0.3-0.6", "--from", str(tmp_path / "one")]

@@ -32,11 +32,12 @@ def free_port() -> int:
         return s.getsockname()[1]
 
 
-def pair(folder: Path, iterations: int, bad_rank: int = -1) -> None:
-    """A run of two processes."""
-    folder.mkdir(exist_ok=True)
-    args = (2, free_port(), str(folder), iterations, bad_rank)
-    torch.multiprocessing.spawn(spawned, args, nprocs=2)
+def pair(*runs: tuple[Path, int, int]) -> None:
+    """Runs of two processes, one after the other: folder, iterations and the rank that goes bad."""
+    for folder, *_ in runs:
+        folder.mkdir(exist_ok=True)
+    told = [(free_port(), str(folder), iterations, bad) for folder, iterations, bad in runs]
+    torch.multiprocessing.spawn(spawned, (2, told), nprocs=2)
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -45,10 +46,17 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("two")
-    pair(folder, 5)
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of runs: "two" whole, "parts" gone on with in new processes, "bad" that stopped."""
+    folder = tmp_path_factory.mktemp("runs")
+    pair((folder / "two", 5, -1), (folder / "parts", 2, -1))
+    pair((folder / "bad", 3, 1), (folder / "parts", 5, -1))
     return folder
+
+
+@pytest.fixture(scope="module")
+def two(runs: Path) -> Path:
+    return runs / "two"
 
 
 def test_two_processes_equal_one(two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,14 +97,12 @@ def test_no_thread_of_the_group_outlives_it(two: Path) -> None:
         assert not [t for t in (two / f"threads{rank}.txt").read_text().split() if "gloo" in t]
 
 
-def test_a_resumed_pair_is_bit_exact(two: Path, tmp_path: Path) -> None:
-    pair(tmp_path / "parts", 2)
-    pair(tmp_path / "parts", 5)
-    a, b = load_checkpoint(two / LATEST)[0], load_checkpoint(tmp_path / "parts" / LATEST)[0]
+def test_a_resumed_pair_is_bit_exact(two: Path, runs: Path) -> None:
+    a, b = load_checkpoint(two / LATEST)[0], load_checkpoint(runs / "parts" / LATEST)[0]
     assert a.keys() == b.keys() and any(k.startswith("rank1/env/") for k in a)
     for k in a.keys() - {"trainer/counters"}:
         assert torch.equal(a[k], b[k]), k
-    assert rows(two) == rows(tmp_path / "parts")
+    assert rows(two) == rows(runs / "parts")
 
 
 def test_another_number_of_processes_is_refused(two: Path) -> None:
@@ -104,12 +110,11 @@ def test_another_number_of_processes_is_refused(two: Path) -> None:
         trainer().load(two / LATEST)
 
 
-def test_a_fault_in_one_process_stops_both(tmp_path: Path) -> None:
-    pair(tmp_path, 3, bad_rank=1)
-    assert "process 1 stopped" in (tmp_path / "error0.txt").read_text()
-    assert "not finite" in (tmp_path / "error0.txt").read_text()
-    assert "not finite" in (tmp_path / "error1.txt").read_text()
-    assert (tmp_path / LAST_GOOD).exists()
+def test_a_fault_in_one_process_stops_both(runs: Path) -> None:
+    told = [(runs / "bad" / f"error{rank}.txt").read_text() for rank in (0, 1)]
+    assert "process 1 stopped" in told[0]
+    assert all("not finite" in text for text in told)
+    assert (runs / "bad" / LAST_GOOD).exists()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")

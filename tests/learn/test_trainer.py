@@ -183,7 +183,7 @@ usual = time.perf_counter() - start
 for attempt in range(60):
     pid = os.fork()
     if pid == 0:
-        run(make(), Until(iterations=40), folder, every=int(sys.argv[3]))
+        run(make(), Until(iterations=24), folder, every=int(sys.argv[3]))
         os._exit(0)
     if attempt < 59:
         time.sleep(rng.uniform(0, 0.35 * usual))
@@ -210,7 +210,7 @@ def test_kills_at_random_moments_change_nothing(every, tmp_path):
     assert done.returncode == 0, f"seed {seed}: {done.stderr[-2000:]}"
     kills, places = map(int, done.stdout.split())
     assert kills >= 2 and places >= 2, f"seed {seed}: {kills} kills at {places} iterations"
-    run(make(), Until(iterations=40), tmp_path / "whole", tensorboard=False)
+    run(make(), Until(iterations=24), tmp_path / "whole", tensorboard=False)
     whole, killed = (load_checkpoint(tmp_path / name / LATEST)[0] for name in ("whole", "killed"))
     assert_same(whole, killed)
     assert rows(tmp_path / "whole") == rows(tmp_path / "killed"), f"seed {seed}"

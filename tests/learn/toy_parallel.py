@@ -92,12 +92,13 @@ def train(folder: Path, iterations: int, bad_rank: int = -1) -> None:
         (folder / f"weights{comm.rank}.txt").write_text(" ".join(map(float.hex, weights.tolist())))
 
 
-def spawned(rank: int, size: int, port: int, folder: str, iterations: int, bad_rank: int) -> None:
+def spawned(rank: int, size: int, runs: list[tuple[int, str, int, int]]) -> None:
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(size), "LOCAL_WORLD_SIZE": str(size)}
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    train(Path(folder), iterations, bad_rank)
-    threads = [t.read_text().strip() for t in Path("/proc/self/task").glob("*/comm")]
-    (Path(folder) / f"threads{rank}.txt").write_text("\n".join(threads))
+    for port, folder, iterations, bad_rank in runs:
+        os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+        train(Path(folder), iterations, bad_rank)
+        threads = [t.read_text().strip() for t in Path("/proc/self/task").glob("*/comm")]
+        (Path(folder) / f"threads{rank}.txt").write_text("\n".join(threads))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def test_a_steady_motion_is_read_steadily(rate: float, late: float) -> None:
     buffer = filled(0.4, rate, 4.0, late)
     if rate == 120:
         # No more is kept than is needed.
-        assert len(buffer._frames) <= 320
+        assert len(buffer.frames) <= 320
     for now in (103.6, 103.8, 103.9):
         pose = buffer.read(now)
         assert pose is not None

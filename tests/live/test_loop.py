@@ -263,8 +263,8 @@ def test_a_clip_passes_over_where_its_ends_are_most_alike(walk: Clip) -> None:
         return float((1.0 - np.abs((walk.rot[a, 1:] * walk.rot[b, 1:]).sum(-1))).sum())
 
     loop = Loop(walk)
-    assert 0 <= loop._first < loop._last - loop.fade and loop._last + loop.fade <= walk.frames
-    assert apart(loop._first, loop._last) < apart(0, walk.frames - loop.fade)
+    assert 0 <= loop.first < loop.last - loop.fade and loop.last + loop.fade <= walk.frames
+    assert apart(loop.first, loop.last) < apart(0, walk.frames - loop.fade)
     for frames in (2, 3, 7):
         short = Loop(walk.replaced(root_pos=walk.root_pos[:frames], rot=walk.rot[:frames]))
         assert all(np.isfinite(short(k)[0]).all() for k in range(20))

@@ -124,7 +124,7 @@ def test_what_is_read_is_later_by_what_is_stated(walk: Clip) -> None:
 def test_packets_at_once_make_no_difference(walk: Clip) -> None:
     dirty = stream(walk, 4.0, 0.03)
     one, five = through(dirty).buffer, through(dirty, 5).buffer
-    for a, b in zip(one._frames, five._frames, strict=True):
+    for a, b in zip(one.frames, five.frames, strict=True):
         np.testing.assert_array_equal(a.root_pos, b.root_pos)
         np.testing.assert_array_equal(a.rot, b.rot)
     # Nor do packets that come late, which are left out, or twice.
@@ -134,7 +134,7 @@ def test_packets_at_once_make_no_difference(walk: Clip) -> None:
         inbox.offer(dirty[max(k - 2, 0)], packet.time_s)
     for arrived, came in inbox.take()["a"]:
         person.add(came, arrived, lambda *_: "no body")
-    np.testing.assert_array_equal(person.buffer._frames[-1].rot, one._frames[-1].rot)
+    np.testing.assert_array_equal(person.buffer.frames[-1].rot, one.frames[-1].rot)
 
 
 def test_who_is_elsewhere_is_there_at_once(walk: Clip) -> None:
@@ -144,10 +144,10 @@ def test_who_is_elsewhere_is_there_at_once(walk: Clip) -> None:
         p = dirty[j]
         dirty[j] = Packet("a", p.time_s, p.skeleton, p.root_pos + np.eye(3)[0] * 5.0, p.rot, walk)
     person = through(dirty[: k + 1])
-    np.testing.assert_array_equal(person.buffer._frames[-1].root_pos, dirty[k].root_pos)
+    np.testing.assert_array_equal(person.buffer.frames[-1].root_pos, dirty[k].root_pos)
     assert person.buffer.jumps == 1
     # Those before it stay where they were.
-    assert abs(person.buffer._frames[-2].root_pos[0] - dirty[k - 1].root_pos[0]) < 0.02
+    assert abs(person.buffer.frames[-2].root_pos[0] - dirty[k - 1].root_pos[0]) < 0.02
     after = through(dirty).buffer
     assert after.jumps == 1 and after.tremble.late_s == LATE_S
 
@@ -202,5 +202,5 @@ def test_refused_packets_leave_the_filter_alone(walk: Clip) -> None:
         assert not inbox.offer(Packet("a", p.time_s + 0.01, p.skeleton, p.root_pos, bad), p.time_s)
         for arrived, came in inbox.take()["a"]:
             person.add(came, arrived, lambda *_: "no body")
-    np.testing.assert_array_equal(person.buffer._frames[-1].rot, through(dirty).buffer._frames[-1].rot)
+    np.testing.assert_array_equal(person.buffer.frames[-1].rot, through(dirty).buffer.frames[-1].rot)
     assert inbox.refused["not finite"] == len(dirty)

@@ -97,13 +97,13 @@ def test_all_headings_of_an_environment_are_those_of_the_hips() -> None:
     assert float(left.norm()) == pytest.approx(1.0, abs=1e-6)
     env.reset_to(HERE, HERE * 2)
     env.step(actions(env, 1)[0])
-    frame = env._frame()
+    frame = env.view()
     for pose in (frame.sim, frame.ref, frame.ahead, env.pose(), env.goal_pose()):
         assert torch.equal(pose.heading, lateral_heading(pose.qpos[:, 3:7], left))
     # A clip is seen as a character that does it: what a motion prior sees of both is the same.
     env.reset_to(HERE, HERE * 2)
     row = env.reference.rows(HERE, HERE * 2)
-    seen = seen_by(env._terms.style, env._frame())
+    seen = seen_by(env.task.style, env.view())
     torch.testing.assert_close(env._clip_features(row), seen, atol=2e-4, rtol=1e-3)
     env.close()
 
@@ -173,7 +173,7 @@ def test_unfiltered_states_what_acts() -> None:
 def test_a_window_tells_the_frames_of_the_clip() -> None:
     env = an_env(window=(2, 4))
     env.reset_to(HERE, HERE * 3)
-    window = env._frame().window
+    window = env.view().window
     assert window.pos.shape == (4, 2, len(env.goal.humanoid.bodies), 3)
     for i, k in enumerate((2, 4)):
         assert torch.equal(window.pos[:, i], env.reference.gather(HERE, HERE * 3 + k).pos)
@@ -199,7 +199,7 @@ def test_a_stream_repeats_its_last_frame() -> None:
     stream.push(frames[1])
     env.step(torch.zeros(1, env.num_actions))
     stream.push(frames[2])
-    told = env._frame()
+    told = env.view()
     torch.testing.assert_close(told.ahead.qpos[0], frames[2].float())
     for i in range(2):
         assert torch.equal(told.window.qpos[:, i], told.ahead.qpos)
@@ -227,7 +227,7 @@ def test_costs_of_an_environment_are_those_of_its_steps() -> None:
     action = torque = None
     for u in actions(env):
         env.step(u)
-        now = env._frame().torque.clone()
+        now = env.view().torque.clone()
         if action is None:
             assert not env.terms["action_rate"].any() and not env.terms["torque_rate"].any()
         else:
@@ -259,7 +259,7 @@ def test_what_smooth_policies_do_not_answer_to_are_the_goals_velocities(goal: st
     imitation = built(**given)
     env = imitation.env(4, threads=1, auto_reset=False)
     env.reset()
-    frame, parts = env._frame(), [env.columns[name] for name in imitation.task.velocities]
+    frame, parts = env.view(), [env.columns[name] for name in imitation.task.velocities]
     first, last = parts[0].start, parts[-1].stop
     before = seen_by(imitation.task.obs, frame)
     frame.ahead.linvel.add_(1.0)

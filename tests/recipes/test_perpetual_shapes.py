@@ -124,7 +124,7 @@ def test_references_stand_on_the_floor_of_their_bodies(imitation: Imitation) -> 
 
 def test_the_observation_tells_the_bodies_apart(imitation: Imitation) -> None:
     env = imitation.env(9, threads=1, auto_reset=False)
-    at = obs.self_state(env._frame()).shape[1]
+    at = obs.self_state(env.view()).shape[1]
     width = 2 * len(imitation.humanoid.bodies) - 1
     clip = torch.arange(9)
     seen = env.reset_to(clip, torch.zeros_like(clip))[:, at : at + width]

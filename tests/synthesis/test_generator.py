@@ -51,7 +51,7 @@ def motions(tracker: Tracker) -> Motions:
 @pytest.fixture(scope="module")
 def trained(motions: Motions, tmp_path_factory: pytest.TempPathFactory) -> tuple[GeneratorModel, Path]:
     folder = tmp_path_factory.mktemp("run")
-    config = Endless(SMALL, CVAETraining(batch=16), steps=120, ema=0.9)
+    config = Endless(SMALL, CVAETraining(batch=16), steps=60, ema=0.9)
     return train_generator(motions, folder, config)[0], folder
 
 

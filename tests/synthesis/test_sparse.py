@@ -21,7 +21,7 @@ from refusals import refused
 from toy_human import swing
 from toy_policy import walk
 
-FEW = LookaheadConfig(candidates=12, smoothing=(0.0, 0.5))
+FEW = LookaheadConfig(candidates=10, horizon=6, smoothing=(0.0, 0.5))
 
 
 def poses(clip: Clip, frames: tuple[int, ...]) -> Clip:
@@ -106,7 +106,7 @@ def test_poses_become_a_motion(tmp_path: Path, capsys) -> None:
     words = ["complete", str(file), "--keyframes", "all", "-o", str(tmp_path / "out"), "--json"]
     assert main(words) == 2
     assert "leaves nothing to fill" in capsys.readouterr().err
-    quick = ["--adapt", "0", "--budget", "60", "--threads", "1", "--controller", "lookahead"]
+    quick = ["--adapt", "0", "--budget", "30", "--threads", "1", "--controller", "lookahead"]
     assert main([*words, "--times", "0,1,2", *quick]) == 0
     assert json.loads(capsys.readouterr().out)["result"]["at"] == [0, 30, 60]
     filled = tmp_path / "filled.bvh"

@@ -277,6 +277,12 @@ class Strength:
         return cls(m * length, length**0.5, m * length**2)
 
 
+def leg_length(table: BodyTable) -> float:
+    """m, from hip to knee and on to ankle, the mean of both legs."""
+    rows = [r for r in table.rows if r.kind in ("shin", "foot")]
+    return sum(math.dist(r.pos, (0.0, 0.0, 0.0)) for r in rows) / 2.0
+
+
 def length_factor(height_m: float) -> float:
     """L: 1 for adults of `ADULT_M`, else the height over the nearer edge of that span."""
     return height_m / float(np.clip(height_m, *ADULT_M))

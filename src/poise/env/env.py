@@ -169,7 +169,8 @@ class ImitationEnv:
         task: the terms, and what the environment holds beside them (`env.task`).
         substeps: physics steps of a control step.
         weights: `(C,)` odds with which clips are drawn, see `Starts`.
-        fused: terms are recorded once and replayed as a whole, see `Terms`; off, one by one.
+        fused: terms that are often evaluated are recorded and replayed as a whole, see `Terms`; off, one
+            by one.
 
     Attributes:
         goal, task, backend: as given.
@@ -223,7 +224,7 @@ class ImitationEnv:
         if self.goal.begins:
             self._place(None, None)
         self.num_obs = self.observe().shape[1]
-        self._style = seen_by(self._terms.style, self._frame())
+        self._style = seen_by(self._terms.style, self.view())
         self._obs = torch.empty(n, self.num_obs, device=here)
 
     def _make_terms(self, fused: bool) -> Terms:
@@ -442,6 +443,15 @@ class ImitationEnv:
         self._watched()
         return self._observe()
 
+    def record_at_once(self) -> None:
+        """Terms are recorded now, for real time: else a later step takes the time of fifty."""
+        self._terms.record_at_once()
+        told = self._sources.of(self._told())
+        # A recording is made at the first call, and made fast at the second.
+        for _ in range(2):
+            self._terms.observe(told)
+            self._terms.judge(told)
+
     def pose(self) -> Pose:
         """The simulated characters now."""
         lazy = self.here()
@@ -459,7 +469,7 @@ class ImitationEnv:
         """What world `env` is at, for messages."""
         return self.goal.where(env)
 
-    def _frame(self) -> Frame:
+    def view(self) -> Frame:
         """What the terms see of all worlds, from nothing but where they are."""
         return self._terms.frame(self._sources.live(self._told()))
 
@@ -476,7 +486,7 @@ class ImitationEnv:
     def columns(self) -> dict[str, slice]:
         """The columns of the observations by name, in order: those of each term, such as
         "rotation_goal", and of its parts, such as "rotation_goal.linvel", see `ObsTerm.parts`."""
-        out, frame = dict[str, slice](), self._frame()
+        out, frame = dict[str, slice](), self.view()
         first = 0
         for term in self._terms.obs:
             width = seen_by((term,), frame).shape[1]

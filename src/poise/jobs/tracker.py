@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
+from poise.body.body_table import leg_length
 from poise.body.humanoid import make_humanoid
 from poise.env.recovery.get_up import RecoveryClips
 from poise.errors import PoiseError
@@ -29,6 +30,7 @@ from poise.learn import PolicyBundle, Value, load_checkpoint, save_checkpoint
 from poise.learn.checkpoint import PolicyMeta, prefixed, under
 from poise.learn.policy import policy_in
 from poise.motion import Clip, trim
+from poise.recipes.perpetual import lengths_seen
 from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.settings import check_data, to_data
 from poise.version import __version__
@@ -99,12 +101,21 @@ class Tracker:
     def with_bones_of(self, clip: Clip) -> Tracker:
         """The policy on its own bodies and hinges with the lengths and masses of a clip's skeleton.
 
+        It sees lengths and speeds in units of its legs: as if the character and all that it does were
+        as large as the body that it was trained on.
+
         Raises:
             PoiseError: see `own_body`.
         """
         table, example = own_body(clip, self.humanoid.table, self.example, self.config.body)
         humanoid = make_humanoid(example.skeleton, table)
-        return replace(self, humanoid=humanoid, example=example, onto=onto_own(humanoid.table))
+        own = replace(self, humanoid=humanoid, example=example, onto=onto_own(humanoid.table))
+        lengths = lengths_seen(self.config, self.humanoid)
+        if len(lengths) != self.policy.num_obs:
+            return own
+        size = leg_length(self.humanoid.table) / leg_length(table)
+        policy = self.policy.seeing(torch.where(lengths, size, 1.0))
+        return replace(own, policy=policy, value=None if self.value is None else self.value.of(policy))
 
     def with_damping(self, seconds: float) -> Tracker:
         """The policy on its body with other servos, which it does not know yet and has to learn.

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from poise.errors import PoiseError
+from poise.learn.adam import Adam
 from poise.learn.checkpoint import (
     State,
     load_module,
@@ -233,7 +234,7 @@ class Amp:
         init = make_generator(seed, "discriminator")
         sizes = (config.frames, features, config.hidden, config.activation, config.clip)
         self.net = Discriminator(*sizes, generator=init).to(device)
-        self.optimizer = torch.optim.Adam(self.net.net.parameters(), lr=config.lr, fused=True)
+        self.optimizer = Adam(self.net.net.parameters(), lr=config.lr)
         # Draws live on the CPU, so that a seed means the same ones on every device.
         self.rng = make_generator(seed, f"style {comm.rank}")
         width = config.frames * features

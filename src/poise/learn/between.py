@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from poise.errors import PoiseError
+from poise.learn.adam import Adam, Optimizer
 from poise.learn.networks import bfloat16_is_fast
 from poise.learn.transition import (
     FilledGap,
@@ -467,9 +468,7 @@ class BetweenObjective:
         plain = [p for p in net.parameters() if p.ndim <= 1]
         groups = [{"params": decayed, "weight_decay": config.weight_decay},
                   {"params": plain, "weight_decay": 0.0}]  # fmt: skip
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "net": torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98), fused=True)
-        }
+        self.optimizers: dict[str, Optimizer] = {"net": Adam(groups, lr=config.lr, betas=(0.9, 0.98))}
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
 
     def modules(self) -> Mapping[str, torch.nn.Module]:

@@ -22,6 +22,7 @@ from safetensors.torch import save as serialise_tensors
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
+from poise.learn.adam import Optimizer
 from poise.settings import check_data
 from poise.version import __version__
 
@@ -283,7 +284,7 @@ def load_module(module: nn.Module, state: Mapping[str, Tensor], name: str) -> No
             value.copy_(saved[key])
 
 
-def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
+def optimizer_state(optimizer: Optimizer) -> State:
     """Learning rates and moments, numbered in the order of the parameters."""
     lr = [group["lr"] for group in optimizer.param_groups]
     out = {"lr": torch.tensor(lr, dtype=torch.float64)}
@@ -294,7 +295,7 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
     return out
 
 
-def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor]) -> None:
+def load_optimizer_state(optimizer: Optimizer, state: Mapping[str, Tensor]) -> None:
     """Restores what `optimizer_state` returned."""
     rates, hint = take(state, "lr"), "Use the layer sizes with which the state was saved"
     if rates.shape != (len(optimizer.param_groups),):

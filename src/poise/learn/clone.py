@@ -10,6 +10,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from poise.learn.adam import Adam
 from poise.learn.checkpoint import (
     State,
     load_optimizer_state,
@@ -138,7 +139,7 @@ class _Fitter:
         # The action noise is not taught.
         names = actor.policy.named_parameters()
         self.params = [p for name, p in names if p.requires_grad and name != "log_std"]
-        self.optimizer = torch.optim.Adam(self.params, lr=config.lr, fused=True)
+        self.optimizer = Adam(self.params, lr=config.lr)
 
     def add(self, obs: Tensor, action: Tensor) -> None:
         """Keeps one step of every environment."""
@@ -281,7 +282,7 @@ class Student:
         self.ppo, self.lessons, self.config = ppo, lessons, config
         names = ppo.actor.policy.named_parameters()
         self._params = [p for name, p in names if p.requires_grad and name != "log_std"]
-        self._adam = torch.optim.Adam(self._params, lr=config.lr, fused=True)
+        self._adam = Adam(self._params, lr=config.lr)
         self._draws = make_generator(seed, "lessons")
         self._obs = torch.zeros(0, ppo.actor.num_obs)
         self._action = torch.zeros(0, ppo.actor.num_actions)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
+from poise.learn.adam import Adam, Optimizer
 from poise.learn.networks import MLP, bare_linear, bfloat16_is_fast, product
 from poise.settings import Checked, Count, Positive, Range
 
@@ -445,9 +446,7 @@ class CVAEObjective:
     ):
         self.net, self.config, self.steps, self.weights = net, config, steps, weights
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "net": torch.optim.Adam(net.parameters(), lr=config.lr, fused=True)
-        }
+        self.optimizers: dict[str, Optimizer] = {"net": Adam(net.parameters(), lr=config.lr)}
 
     def modules(self) -> Mapping[str, torch.nn.Module]:
         """What is trained, by name."""

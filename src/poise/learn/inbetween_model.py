@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
+from poise.learn.adam import Adam, Optimizer
 from poise.learn.checkpoint import (
     LATEST,
     ModelMeta,
@@ -45,7 +46,7 @@ _SAVING = 20.0
 class Objective(Protocol):
     """How a network learns from windows; the trainer only repeats it and keeps its state."""
 
-    optimizers: dict[str, torch.optim.Optimizer]
+    optimizers: dict[str, Optimizer]
 
     def modules(self) -> Mapping[str, nn.Module]:
         """Everything with weights, by name; "net" is the network itself."""
@@ -508,8 +509,8 @@ def adapt(
     config = config or Adaptation()
     own = copy.deepcopy(net)
     params = [p for p in own.parameters() if p.requires_grad_(True) is p]
-    kind = torch.optim.Adam if config.optimizer == "adam" else torch.optim.SGD
-    optimizer = kind(params, lr=config.lr)
+    adam = config.optimizer == "adam"
+    optimizer = Adam(params, config.lr, fused=False) if adam else torch.optim.SGD(params, config.lr)
     count, often = len(known.target_root), config.steps == "minibatch"
     for iteration in range(1, config.iterations + 1):
         total = 0.0
@@ -533,7 +534,7 @@ def adapt(
     return own
 
 
-def _stepped(optimizer: torch.optim.Optimizer, loss: float) -> None:
+def _stepped(optimizer: Optimizer, loss: float) -> None:
     if not loss < float("inf"):
         raise TrainingError(
             "the loss of the adaptation is not finite", hint="Lower its lr", code="training-diverged"

@@ -155,6 +155,17 @@ class PolicyBundle:
         out.load_state({k: fitted(k, v) for k, v in self.state().items()})
         return out
 
+    def seeing(self, factors: Tensor) -> PolicyBundle:
+        """The same policy that acts on `x` as this one on `factors (O,) * x`, such as metres as if its
+        body had another size."""
+        out = self.copy()
+        state = out.state()
+        for name, power in (("mean", 1), ("shift", 1), ("std", 1), ("m2", 2)):
+            own = state[f"norm/{name}"]
+            state[f"norm/{name}"] = (own.double() / factors.double() ** power).to(own)
+        out.load_state(state)
+        return out
+
     def widened(self, num_obs: int, columns: Tensor) -> PolicyBundle:
         """The same policy for observations of `num_obs` numbers, of which it reads those at `columns
         (O,)`. What it does not read yet has weights of 0, a mean of 0 and a deviation of 1."""
@@ -228,6 +239,12 @@ class Value:
         self.critic = MLP(policy.num_obs, widths[:-1], 1, activation, generator=rng)
         load_module(self.critic, state, "critic")
         load_module(self.scale, state, "return_norm")
+
+    def of(self, policy: PolicyBundle) -> Value:
+        """The same critic behind another policy's normaliser."""
+        out = copy.copy(self)
+        out.norm = policy.norm
+        return out
 
     @torch.no_grad()
     def __call__(self, obs: Tensor) -> Tensor:

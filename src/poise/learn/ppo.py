@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.learn.adam import Adam
 from poise.learn.checkpoint import (
     State,
     load_module,
@@ -342,8 +343,8 @@ class PPO:
         self._policy_params = [p for p in self.actor.policy.parameters() if p.requires_grad]
         self._value_params = list(self.critic.parameters())
         # Policy and critic share nothing, so that each can be trained in a thread of its own.
-        self.optimizer = torch.optim.Adam(self._policy_params, lr=config.policy_lr, fused=True)
-        self.value_optimizer = torch.optim.Adam(self._value_params, lr=config.value_lr, fused=True)
+        self.optimizer = Adam(self._policy_params, lr=config.policy_lr)
+        self.value_optimizer = Adam(self._value_params, lr=config.value_lr)
         here = torch.device(device).type == "cpu"
         self._half = config.products == "bfloat16" or (
             config.products == "auto" and here and bfloat16_is_fast()

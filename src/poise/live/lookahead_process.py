@@ -49,6 +49,7 @@ def tries_of(tracker: Tracker, config: LookaheadConfig, seed: int) -> Lookahead:
     goal.push(tracker.recovery_clips.ease)
     goal.reset(torch.arange(out.copies.num_envs))
     out.copies.set_goal(goal)
+    out.copies.record_at_once()
     return out
 
 

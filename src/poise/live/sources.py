@@ -38,26 +38,30 @@ class Loop:
 
     It is played from its first frame on. From one near its end it passes over to one near its
     beginning, those two of them that are most alike, so that a walk goes on in step.
+
+    Attributes:
+        first, last: frames from which and to which each round after the first is played.
+        fade: frames in which it passes over.
     """
 
     def __init__(self, clip: Clip):
         self.clip = clip
         self.fade = min(round(FADE_S * clip.fps), (clip.frames - 1) // 2)
-        self._first, self._last = _seam(clip, self.fade)
+        self.first, self.last = _seam(clip, self.fade)
         # By how much each round is turned and moved against the one before.
-        self._turn = q.heading(clip.rot[self._last, 0]) - q.heading(clip.rot[self._first, 0])
+        self._turn = q.heading(clip.rot[self.last, 0]) - q.heading(clip.rot[self.first, 0])
         turn = q.yaw(self._turn)
-        move = clip.root_pos[self._last] - q.rotate(turn, clip.root_pos[self._first])
+        move = clip.root_pos[self.last] - q.rotate(turn, clip.root_pos[self.first])
         self._move = np.array([move[0], move[1], 0.0])
 
     def __call__(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Root `(3)` m and local rotations `(J, 4)` of frame 0, 1, 2, ..."""
-        if frame < self._last:
+        if frame < self.last:
             return self._of(0, frame)
-        rounds, at = divmod(frame - self._last, max(1, self._last - self._first))
-        root, rot = self._of(rounds + 1, self._first + at)
+        rounds, at = divmod(frame - self.last, max(1, self.last - self.first))
+        root, rot = self._of(rounds + 1, self.first + at)
         if at < self.fade:
-            was, turned = self._of(rounds, self._last + at)
+            was, turned = self._of(rounds, self.last + at)
             share = (at + 1) / (self.fade + 1)
             root = was + share * (root - was)
             rot = q.slerp(turned, rot, share)

@@ -263,12 +263,13 @@ class JitterBuffer:
 
     Attributes:
         tremble: what the person does now.
+        frames: the poses that are kept, the newest last.
     """
 
     def __init__(self, delay_s: float = 0.1):
         self.delay_s, self.tremble = delay_s, StreamTremble()
         self.late = self.jumps = 0
-        self._frames: deque[_Frame] = deque(maxlen=KEPT)
+        self.frames: deque[_Frame] = deque(maxlen=KEPT)
         self._ways: deque[float] = deque(maxlen=SEEN)
         self._way = 0.0
         self._arrived = -np.inf
@@ -293,7 +294,7 @@ class JitterBuffer:
         self._ways.append(way)
         self._way = min(self._ways)
         self._arrived = max(self._arrived, arrived_s)
-        frames = self._frames
+        frames = self.frames
         if frames and time_s < frames[-1].time_s - 2.0:
             # A source that began anew.
             frames.clear()
@@ -317,7 +318,7 @@ class JitterBuffer:
 
     def read(self, now_s: float) -> StreamPose | None:
         """The pose at `now_s` by the loop's clock; None before anything has come."""
-        frames = self._frames
+        frames = self.frames
         if not frames:
             return None
         at = now_s - self._way - margin(self.delay_s) - self._kept_back(now_s)
@@ -352,10 +353,10 @@ class JitterBuffer:
     def _beyond(self, at: float) -> tuple[_Frame, _Frame, float]:
         """The last two frames and a share of the way between them, beyond 1: q_0 + v_0 tau
         (1 - e^(-t / tau)), where the motion goes on, and comes to rest."""
-        last = self._frames[-1]
-        if len(self._frames) < 2 or last.leaps:
+        last = self.frames[-1]
+        if len(self.frames) < 2 or last.leaps:
             return last, last, 0.0
-        before = self._frames[-2]
+        before = self.frames[-2]
         dt = max(last.time_s - before.time_s, 1e-3)
         if dt > 0.25:
             return last, last, 0.0

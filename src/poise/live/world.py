@@ -183,6 +183,7 @@ class LiveWorld:
         # Snapshots are of a character alone, so that lookahead can try with it.
         self.rows = CharacterRows(self.scene.backend, places, alone(body, sim), self.scene)
         self.env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=self.rows)
+        self.env.record_at_once()
         hands, yielding = self.env.event(PushInput), self.env.event(Yielding)
         assert hands is not None and yielding is not None
         self.hands, self.yielding = hands, yielding

@@ -234,6 +234,23 @@ def _more_seen(config: Perpetual, humanoid: Humanoid) -> tuple[ObsTerm, ...]:
     return (*last, *later, *yields)
 
 
+def lengths_seen(config: Perpetual, humanoid: Humanoid) -> Tensor:
+    """`(O,)` bool, the observations that are lengths or speeds, m or m/s; none where the policy is told
+    the size of its body."""
+    bodies, keys = len(humanoid.bodies), len(humanoid.rows_of(*KEY_PARTS))
+    hinges, turns = len(humanoid.hinges), 2 if config.goal == "rotations" else 0
+    # Height, places and velocities; angular velocities and rotations.
+    widths = [(6 * bodies - 2, True), (9 * bodies, False)]
+    parts = obs.ROTATION_PARTS if config.goal == "rotations" else obs.KEYPOINT_PARTS
+    widths += [(n * bodies, part in ("pos", "linvel", "place")) for part, n in parts.items()]
+    widths += [(hinges, False)] if config.filter else []
+    widths += [(3 + 3 * keys, True), (turns, False)] * len(config.window)
+    # The dial, the root's way, the hinges' turns.
+    widths += [(1, False), (3, True), (hinges, False)] if config.pushes else []
+    seen = torch.cat([torch.full((n,), length) for n, length in widths])
+    return seen.new_zeros(0) if config.shape or config.shapes.several else seen
+
+
 def pushed(task: TaskConfig, config: Perpetual, humanoid: Humanoid) -> TaskConfig:
     """The task of a training in which characters are pushed; as it is without `Perpetual.pushes`."""
     plan = config.pushes

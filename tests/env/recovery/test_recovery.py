@@ -198,7 +198,7 @@ def test_far_away_the_goal_is_a_point_and_near_all_of_the_motion(built):
     env.reset_to(*at(3, 4))
     away = torch.tensor([0.4, 3.0, 12.0])
     move(env, torch.stack((-away, 0 * away, 0 * away), -1))
-    frame, whole = env._frame(), env.reference.gather(env.clip, env.frame + 1)
+    frame, whole = env.view(), env.reference.gather(env.clip, env.frame + 1)
     sim, ahead, bodies = frame.sim, frame.ahead, len(built.humanoid.bodies)
     assert frame.point is not None and ahead is not None
     assert frame.point.far.tolist() == [False, True, True]
@@ -234,7 +234,7 @@ def test_what_a_policy_sees_of_a_point_does_not_depend_on_how_the_reference_move
     env = env_of(built, 2, auto_reset=False, obs=terms)
     env.reset_to(*at(2, 3))
     move(env, torch.tensor([[0.0, 2.0, 0.0]] * 2))
-    frame = env._frame()
+    frame = env.view()
     assert frame.ahead is not None
     other = env.reference.gather(env.clip, torch.tensor([4, 40]))
     qpos = frame.sim.qpos  # Another moment of the clip, its root at the same place and turn.
@@ -284,7 +284,7 @@ def test_the_codes_reward_counts_progress_everywhere_and_imitation_by_half(built
     paper = {t.name: t for t in reward.recovery_terms(base)}
     assert paper["energy_far"].weight == pytest.approx(0.1 * base[4].weight)
     env = env_of(built, 3, rewards=tuple(code.values()))
-    frame = env._frame()
+    frame = env.view()
     before, now = torch.tensor([1.0, 3.0, 2.0]), torch.tensor([0.9, 2.0, 2.5])
     assert frame.point is not None
     frame = frame.replaced(point=frame.point._replace(before=before, distance=now))
@@ -334,7 +334,7 @@ def test_one_seed_is_one_run_fused_or_not(built):
         env._terms.fused = fused
         env.reset()
         runs.append(rollout(env, 15))
-        assert torch.allclose(runs[-1][-6], env._observe(), atol=2e-5)
+        assert torch.allclose(runs[-1][-6], env.observe(), atol=2e-5)
         env.close()
     assert all(torch.equal(a, b) for a, b in zip(runs[0], runs[1], strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(runs[0], runs[2], strict=True))

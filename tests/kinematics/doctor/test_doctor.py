@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -46,12 +47,16 @@ def walk(request: pytest.FixtureRequest) -> Clip:
     return request.getfixturevalue(request.param)
 
 
+#: What is seen of a clip; its faults and figures are asked for one by one.
+seen_in = lru_cache(maxsize=8)(examine)
+
+
 def found(clip: Clip, kind: str) -> list[Fault]:
-    return [f for f in examine(clip).faults if f.kind == kind]
+    return [f for f in seen_in(clip).faults if f.kind == kind]
 
 
 def figure(clip: Clip, name: str) -> float:
-    value = examine(clip).figures[name]
+    value = seen_in(clip).figures[name]
     assert value is not None
     return value
 

@@ -50,12 +50,12 @@ def moved_goal(env: ImitationEnv) -> DisplacedGoal:
 
 def test_the_state_is_two_poses_without_what_displaces_them(made: Imitation) -> None:
     env = env_of(made)
-    one = env._frame()
+    one = env.view()
     was = one.sim.pos.clone()
     # In a new episode the earlier pose is what the velocities say.
     assert torch.allclose(one.shifted.before, was - one.sim.linvel / 30.0, atol=2e-3)
     env.step(torch.zeros(2, env.num_actions))
-    two = env._frame()
+    two = env.view()
     assert torch.allclose(two.shifted.pos, two.sim.pos, atol=1e-5)
     assert torch.allclose(two.shifted.before, was, atol=1e-5)
     now, before = compliant.two_poses(two).unflatten(1, (2, -1, 3)).unbind(1)
@@ -67,7 +67,7 @@ def test_the_state_is_two_poses_without_what_displaces_them(made: Imitation) -> 
     moved_goal(env).offset[:, 8] = 0.3
     env.backend.state.qpos[:, 9] += 0.3
     env.backend.forward()
-    moved = env._frame()
+    moved = env.view()
     assert not torch.allclose(moved.sim.pos, two.sim.pos, atol=1e-3)
     assert torch.allclose(compliant.posture(moved), calm, atol=1e-4)
     assert float(compliant.displacement(moved, "shifted/u")[0, 8]) == pytest.approx(0.3)
@@ -78,20 +78,18 @@ def test_what_the_discriminator_sees_of_a_clip_is_what_it_sees_of_a_character_on
 ) -> None:
     env = env_of(made)
     demos = env.demos(2).at(torch.tensor([0]), torch.tensor([10]))
-    assert torch.allclose(
-        demos[:, : demos.shape[1] // 2], compliant.posture(env._frame())[:1], atol=1e-3
-    )
+    assert torch.allclose(demos[:, : demos.shape[1] // 2], compliant.posture(env.view())[:1], atol=1e-3)
 
 
 def test_the_positional_reward_is_equation_14(made: Imitation) -> None:
     env = env_of(made)
-    frame = env._frame()
+    frame = env.view()
     assert torch.allclose(compliant.root_place(frame), torch.ones(2), atol=1e-6)
     goal = moved_goal(env)
     goal.offset[:, 0] = 0.5
     goal.rate[:, 1] = 2.0
     away = 0.7 * math.exp(-0.5 * 0.25) + 0.3 * math.exp(-1.0 * 4.0)
-    assert torch.allclose(compliant.root_place(env._frame()), torch.full((2,), away), atol=1e-4)
+    assert torch.allclose(compliant.root_place(env.view()), torch.full((2,), away), atol=1e-4)
 
 
 def test_the_reward_is_a_product(made: Imitation) -> None:

@@ -113,7 +113,7 @@ def test_on_a_trampoline(tracker: Tracker) -> None:
 
 def test_lookahead_tries_in_copies_of_the_scene(tracker: Tracker) -> None:
     scene, tight = TrampolineScene(0.1, first=0.2), {"count": 1, "seconds": 0.6, "threads": 1}
-    few = LookaheadConfig(candidates=20)
+    few = LookaheadConfig(candidates=10, horizon=4)
     alone, ahead, again = (
         play(scene, tracker, None, None, controller=c, lookahead=few, **tight)  # type: ignore[arg-type]
         for c in ("policy", "lookahead", "lookahead")

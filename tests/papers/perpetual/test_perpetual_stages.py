@@ -58,7 +58,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Scripted]]:
 
 def test_primitives_follow_on_what_fails_and_the_composer_on_all(tmp_path: Path, scripted) -> None:
     asked = scripted(script).asked
-    result, shown, _ = watched(tmp_path, tiny(), 40)
+    result, shown, imitation = watched(tmp_path, tiny(), 40)
     stages = list(dict.fromkeys(p.stage.name for p in shown))
     assert stages == ["primitive 1", "primitive 2", "primitive 3", "composer"]
     assert [p.following.name for p in shown if p.following] == stages[1:]
@@ -76,11 +76,7 @@ def test_primitives_follow_on_what_fails_and_the_composer_on_all(tmp_path: Path,
     said = json.loads((tmp_path / "result.json").read_text())
     assert [row["primitive"] for row in said["per_clip"]] == [1, 2, 3]
     assert said["hardest"] == ["turn"] and said["succ"] == pytest.approx(2 / 3)
-
-
-def test_what_a_stage_learned_is_frozen_in_the_next_ones(tmp_path: Path, scripted) -> None:
-    scripted(script)
-    _, _, imitation = watched(tmp_path, tiny(), 40)
+    # What a stage learned is frozen in the next ones.
     whole = load_policy(tmp_path / FINAL, imitation.humanoid.identity)
     assert isinstance(whole.policy, Composer)
     obs = torch.randn(20, whole.num_obs, generator=torch.Generator().manual_seed(0))
@@ -145,6 +141,10 @@ def test_every_evaluation_is_in_the_table(tmp_path: Path, scripted) -> None:
     last = [r for r in rows if r["stage"] == "final"]
     assert [r["succeeded"] for r in last] == ["1", "0", "0"] and {r["help_n"] for r in last} == {"0"}
     assert [r["iteration"] for r in rows if r["stage"] != "final"][::3] == ["2", "4"]
+    # The library goes into the checkpoint of no stage.
+    files = {p.name for p in tmp_path.iterdir()}
+    wanted = {"run.safetensors", LATEST, FINAL, "log.csv", "success.csv", "result.json"}
+    assert files == wanted
 
 
 def test_shares_of_limits() -> None:
@@ -163,14 +163,6 @@ def test_no_clock_decides_where_iterations_are_counted(tmp_path: Path) -> None:
     stages.trainer.seconds = 300.0
     assert stages.share == 0.0
     stages.close()
-
-
-def test_the_library_goes_into_the_checkpoint_of_no_stage(tmp_path: Path, scripted) -> None:
-    scripted(script)
-    watched(tmp_path, tiny(max_primitives=1), 2)
-    files = {p.name for p in tmp_path.iterdir()}
-    wanted = {"run.safetensors", LATEST, FINAL, "log.csv", "success.csv", "result.json"}
-    assert files == wanted
 
 
 def test_a_simulation_that_goes_bad_does_not_end_the_training(

@@ -56,7 +56,7 @@ def test_the_state_says_what_is_missing(full: Imitation) -> None:
     env = full.env(2, auto_reset=False)
     clip, frame = torch.tensor([0, 0]), torch.tensor([3, 20])
     env.reset_to(clip, frame)
-    f = env._frame()
+    f = env.view()
     ref, h = full.reference, full.humanoid.head
     assert h is not None
     for step in (0, 1):
@@ -79,7 +79,7 @@ def test_the_state_knows_no_place_and_no_heading(full: Imitation) -> None:
     env = full.env(2, auto_reset=False)
     zero = torch.zeros(2, dtype=torch.long)
     env.reset_to(zero, zero + 5)
-    here = env._frame()
+    here = env.view()
     turn = torch.tensor([np.cos(0.6), 0.0, 0.0, np.sin(0.6)]).float()
 
     def moved(pose):
@@ -109,7 +109,7 @@ def test_an_episode_ends_half_a_metre_too_low(full: Imitation) -> None:
     env = full.env(2, auto_reset=False)
     zero = torch.zeros(2, dtype=torch.long)
     env.reset_to(zero, zero)
-    f = env._frame()
+    f = env.view()
     assert not reward.root_below(f).any()
     assert reward.root_below(f, margin=-0.01).all()
     env.close()

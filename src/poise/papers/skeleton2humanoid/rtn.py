@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from poise.learn.adam import Adam, Optimizer
 from poise.learn.between import linear, schedule
 from poise.learn.networks import bfloat16_is_fast
 from poise.learn.transition import (
@@ -315,10 +316,9 @@ class RTNObjective:
         )
         self.scales = Scales(len(LOSSES))
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
-        kind = {"lr": config.lr, "betas": (0.5, 0.9), "amsgrad": True}
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "net": torch.optim.Adam(net.parameters(), **kind),
-            "critics": torch.optim.Adam(self.critics.parameters(), **kind),
+        self.optimizers: dict[str, Optimizer] = {
+            name: Adam(of.parameters(), config.lr, (0.5, 0.9), amsgrad=True)
+            for name, of in (("net", net), ("critics", self.critics))
         }
 
     def modules(self) -> Mapping[str, torch.nn.Module]:
