@@ -227,8 +227,8 @@ def test_writing_refuses_and_leaves_nothing(tmp_path: Path) -> None:
             "the file cannot be written (Not a directory). Choose a folder you may write to",
         ),
         (
-            tmp_path / "b.fbx",
-            f"a clip cannot be written as '.fbx'. Suffixes that can be written: {', '.join(WRITERS)}",
+            tmp_path / "b.c3d",
+            f"a clip cannot be written as '.c3d'. Suffixes that can be written: {', '.join(WRITERS)}",
         ),
     ):
         with pytest.raises(PoiseError) as error:
