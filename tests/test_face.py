@@ -93,7 +93,7 @@ def test_what_it_shows(imitated: poise.Result, tmp_path: Path) -> None:
         imitated.save(tmp_path / "all")
     assert imitated.save(tmp_path / "one.bvh", force=True) == {"motion": tmp_path / "one.bvh"}
     with refused("format-not-written"):
-        imitated.save(tmp_path / "one.fbx")
+        imitated.save(tmp_path / "one.amc")
 
 
 def test_a_run_that_nobody_keeps_goes_with_its_result(clip: Path) -> None:

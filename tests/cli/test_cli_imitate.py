@@ -62,8 +62,8 @@ def test_the_motion_goes_into_the_file_that_was_named(
 def test_a_file_that_cannot_be_written_is_refused_before_any_work(
     clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["imitate", str(clip), "-o", str(tmp_path / "moved.fbx")]) == 2
-    assert "cannot be written as '.fbx'" in capsys.readouterr().err and not list(tmp_path.glob("moved*"))
+    assert main(["imitate", str(clip), "-o", str(tmp_path / "moved.amc")]) == 2
+    assert "cannot be written as '.amc'" in capsys.readouterr().err and not list(tmp_path.glob("moved*"))
     same = str(tmp_path / "walk.bvh")
     assert main(["convert", str(clip), same]) == 0
     assert main(["imitate", same, "-o", same]) == 2

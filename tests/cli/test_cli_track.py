@@ -261,7 +261,7 @@ def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, ref
     refused("track", short, *given, "--recover", "--count", "2", words=("a single character",))
     one = ("--policy", file, "-o", tmp_path / "one.bvh", "--count", "2")
     refused("track", short, *one, words=("several files",))
-    refused("track", short, "--policy", file, "-o", tmp_path / "a.fbx", words=("cannot be written",))
+    refused("track", short, "--policy", file, "-o", tmp_path / "a.amc", words=("cannot be written",))
     refused("track", tmp_path / "absent.bvh", *given, words=("absent.bvh",))
     chair = tmp_path / "chair.json"
     refused("track", short, *given, "--support", chair, words=("chair.json", "cannot be read"))

@@ -218,7 +218,7 @@ def test_convert_takes_a_part(clip: Path, tmp_path: Path, answered, refused) -> 
 
 
 def test_convert_refuses_unknown_suffixes_and_itself(clip: Path, tmp_path: Path, refused) -> None:
-    refused("convert", clip, tmp_path / "x.fbx", words=("fbx", ".bvh"))
+    refused("convert", clip, tmp_path / "x.amc", words=("amc", ".bvh"))
     refused("convert", clip, clip, words=("over itself",))
     refused("convert", clip, tmp_path / "x.bvh", "--resample", "0", words=("frame rate",))
     refused("convert", clip, words=("needs OUT", "-o OUT"))
