@@ -43,7 +43,7 @@ def test_the_motion_comes_back_with_a_push_in_it(
     [
         (("--level", "1.2"), "level must lie in 0 to 1, got 1.2"),
         (("--at", "wing"), "there is no part 'wing' to push"),
-        (("--force", "-5"), "the push: newtons must be above 0"),
+        (("--force", "-5"), "--force must be above 0"),
         (("--from", "60"), "the push begins at 60 s, and the motion lasts"),
         (("--direction", "0,1"), "--direction needs three numbers, got '0,1'"),
         (("--direction", "0,1,nan"), "direction must be a finite number"),

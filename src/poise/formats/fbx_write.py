@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from poise.formats.raw import quats_from_z_up, vectors_from_z_up
 from poise.formats.text import write_whole
@@ -123,6 +122,9 @@ def _angles(quats: np.ndarray) -> np.ndarray:
     """`(T, J, 3)` degrees of rotations wxyz: about X, then Y, then Z of the parent; of two ways to say a
     turn the one that is nearer to the frame before."""
     frames, joints = quats.shape[:2]
+    # SciPy is imported where a file is written: reading one needs none of it.
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_quat(quats[..., (1, 2, 3, 0)].reshape(-1, 4))
     # A joint straight up or down leaves one angle free.
     out = np.degrees(turn.as_euler("xyz", suppress_warnings=True)).reshape(frames, joints, 3)
