@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from poise.live.open.actions import Action
-from poise.live.open.job_processes import Job
+from poise.live.open.job_processes import PageJob
 
 
-def problem_of(job: Job) -> str:
+def problem_of(job: PageJob) -> str:
     """Why a job has no result, in a sentence; "" where it has one."""
     if job.state == "crashed" or (job.state == "done" and not job.answer() and job.code):
         how = f"signal {-job.code}" if job.code and job.code < 0 else f"code {job.code}"

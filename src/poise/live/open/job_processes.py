@@ -28,7 +28,7 @@ OUT, SAID = "out.json", "said.txt"
 
 
 @dataclass(eq=False)
-class Job:
+class PageJob:
     """A job: `run(*args, folder)` in a process, which writes `OUT` and `SAID` into its folder.
 
     Attributes:
@@ -43,7 +43,7 @@ class Job:
     folder: Path
     run: Callable[..., None]
     args: tuple[Any, ...]
-    ended: Callable[[Job], None]
+    ended: Callable[[PageJob], None]
     about: dict[str, Any] = field(default_factory=dict[str, Any])
     state: str = "waiting"
     code: int | None = None
@@ -91,14 +91,14 @@ class Workers:
         folder: Path,
         preload: Sequence[str],
         changed: Callable[[], None],
-        broke: Callable[[Job, Exception], None],
+        broke: Callable[[PageJob, Exception], None],
     ):
         self._folder, self._changed, self._broke = folder, changed, broke
         forks = "forkserver" in multiprocessing.get_all_start_methods()
         self._context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:
             self._context.set_forkserver_preload(list(preload))
-        self.jobs: dict[int, Job] = {}
+        self.jobs: dict[int, PageJob] = {}
         self._count, self._stop, self._lock = 0, threading.Event(), threading.RLock()
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._mind, daemon=True)
@@ -109,15 +109,15 @@ class Workers:
         lane: str,
         run: Callable[..., None],
         args: tuple[Any, ...],
-        ended: Callable[[Job], None],
+        ended: Callable[[PageJob], None],
         **about: Any,
-    ) -> Job:
+    ) -> PageJob:
         """Queues a job. ended: is told when it is over, whatever came of it. about: for the page."""
         with self._lock:
             self._count += 1
             folder = self._folder / f"job-{self._count}-{os.getpid()}"
             folder.mkdir(parents=True, exist_ok=True)
-            job = Job(self._count, lane, folder, run, args, ended, about)
+            job = PageJob(self._count, lane, folder, run, args, ended, about)
             self.jobs[job.id] = job
         self._wake.set()
         return job
@@ -183,13 +183,13 @@ class Workers:
             busy = [j for j in self.jobs.values() if j.state in ("running", "stopping")]
         return sum(j.lane == lane for j in busy) < LANES[lane]
 
-    def _start(self, job: Job) -> None:
+    def _start(self, job: PageJob) -> None:
         job.process = self._context.Process(target=_begin, args=(job.run, job.args, str(job.folder)))
         job.began, job.state = time.monotonic(), "running"
         # The first start waits until what is preloaded is there.
         job.process.start()
 
-    def _progress(self, job: Job) -> bool:
+    def _progress(self, job: PageJob) -> bool:
         before = job.text, job.share, job.state, int(time.monotonic() - job.began)
         job.text, job.share = _said(job.folder / SAID, job.text, job.share)
         if job.state == "stopping" and time.monotonic() - job.asked > STOPS_S:
@@ -202,7 +202,7 @@ class Workers:
             return True
         return before != (job.text, job.share, job.state, int(job.told()["seconds"]))
 
-    def _over(self, job: Job, state: str) -> None:
+    def _over(self, job: PageJob, state: str) -> None:
         job.state, job.spent = state, time.monotonic() - job.began if job.began else 0.0
         try:
             job.ended(job)

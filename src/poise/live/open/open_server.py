@@ -32,8 +32,8 @@ from poise.live.open.actions import (
     words_of,
 )
 from poise.live.open.answers import motion_of, problem_of, sentences
-from poise.live.open.job_processes import Job, Workers
-from poise.live.open.project import LARGEST, Project, Take, clean_name, safe_file, write_json
+from poise.live.open.job_processes import PageJob, Workers
+from poise.live.open.project import LARGEST, Project, ProjectTake, clean_name, safe_file, write_json
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, Content, WebServer
 
 SCRIPTS = ("figure", "stage_view", "timeline", "forms", "open")
@@ -118,7 +118,7 @@ class OpenServer:
         self._web.close()
         shutil.rmtree(self._jobs, ignore_errors=True)
 
-    def add_file(self, path: Path, **more: Any) -> Take:
+    def add_file(self, path: Path, **more: Any) -> ProjectTake:
         """A motion of a file, looked at as soon as there is time; the same file is there once."""
         take = self.project.of_path(path)
         if take is None:
@@ -131,7 +131,7 @@ class OpenServer:
         self._changed()
         return take
 
-    def look(self, take: Take) -> None:
+    def look(self, take: ProjectTake) -> None:
         """Has a process read a motion for the page."""
         room = self.project.room(take)
         room.mkdir(parents=True, exist_ok=True)
@@ -143,14 +143,14 @@ class OpenServer:
 
     # --- what jobs came to --------------------------------------------------------------------
 
-    def _looked(self, job: Job) -> None:
+    def _looked(self, job: PageJob) -> None:
         number = job.about["take"]
         self._looking[number] = self._looking.get(number, 1) - 1
         problem = problem_of(job)
         if problem and number in self.project.takes:
             self._tell("refused", problem, number)
 
-    def _worked(self, job: Job) -> None:
+    def _worked(self, job: PageJob) -> None:
         about = job.about
         parent, action = self.project.takes.get(about["take"]), ACTIONS[about["action"]]
         problem, answer = problem_of(job), job.answer()
@@ -185,11 +185,11 @@ class OpenServer:
         self.look(made)
         self._tell("lost" if answer.get("exit_code") else "done", f"{made.name} is there.", made.id)
 
-    def _broke(self, job: Job, problem: Exception) -> None:
+    def _broke(self, job: PageJob, problem: Exception) -> None:
         said = f"{type(problem).__name__}: {problem}"
         self._tell("refused", f"What came of it could not be kept ({said}).", str(job.about.get("take")))
 
-    def _exported(self, job: Job) -> None:
+    def _exported(self, job: PageJob) -> None:
         problem, target = problem_of(job), Path(job.about["target"])
         if problem or not (job.folder / target.name).exists():
             self._tell("refused", problem or "The export was stopped.", job.about["take"])
@@ -199,7 +199,7 @@ class OpenServer:
         self._exports[number] = target
         self._tell("exported", f"{target.name} lies in {target.parent}.", job.about["take"], file=number)
 
-    def _rested(self, job: Job) -> None:
+    def _rested(self, job: PageJob) -> None:
         problem, found = problem_of(job), job.answer().get("boxes")
         text = problem or ("" if found else "The motion rests on nothing but its floor.")
         self._tell("refused" if problem else "rests", text, job.about["take"], boxes=found or [])
@@ -258,7 +258,7 @@ class OpenServer:
             "events": self._events,
         }
 
-    def _stands(self, take: Take) -> list[dict[str, Any]]:
+    def _stands(self, take: ProjectTake) -> list[dict[str, Any]]:
         """What a body that did a motion stood, sat or leaned on."""
         if take.result and take.id not in self._stood:
             try:
@@ -268,7 +268,7 @@ class OpenServer:
                 self._stood[take.id] = []
         return self._stood.get(take.id, [])
 
-    def _stamp(self, take: Take, name: str) -> int:
+    def _stamp(self, take: ProjectTake, name: str) -> int:
         try:
             return (self.project.room(take) / name).stat().st_mtime_ns // 1_000_000
         except OSError:
@@ -451,7 +451,7 @@ class OpenServer:
         self._changed()
         return None
 
-    def _run(self, take: Take, message: Mapping[str, Any]) -> None:
+    def _run(self, take: ProjectTake, message: Mapping[str, Any]) -> None:
         words, line = self._argv(take, message, Path(RESULT))
         action = ACTIONS[str(message.get("action"))]
         values = message.get("values")
@@ -469,7 +469,7 @@ class OpenServer:
         }
         self.workers.submit("work", self._runs.work, (words,), self._worked, **about)
 
-    def _argv(self, take: Take, message: Mapping[str, Any], out: Path) -> tuple[list[str], str]:
+    def _argv(self, take: ProjectTake, message: Mapping[str, Any], out: Path) -> tuple[list[str], str]:
         """The words of a button's command line, and the line for people.
 
         The job writes below `out`, a path in its own folder.
@@ -510,7 +510,7 @@ class OpenServer:
         read_from = safe_file(f"{source.name}{came.suffix}") if source.parent else came.name
         return argv, shlex.join(["poise", action.verb, read_from, *shown, "-o", named])
 
-    def _reads(self, take: Take, action: Action) -> dict[str, Any]:
+    def _reads(self, take: ProjectTake, action: Action) -> dict[str, Any]:
         """How what a button writes is read: a BVH does not say its unit nor its vertical."""
         if action.name == "rig" or self._home(take) != ".bvh":
             return {}
@@ -519,7 +519,7 @@ class OpenServer:
         unit, up = (head.get("unit_m", 0.01), head.get("up_axis", "Y")) if own else (0.01, "Y")
         return {"unit": f"{unit:.9g}", "up": up}
 
-    def _export(self, take: Take, suffix: str) -> None:
+    def _export(self, take: ProjectTake, suffix: str) -> None:
         if suffix not in EXPORTS:
             raise PoiseError("that format is not written", code="format-not-written")
         target = self.project.free_file("exports", f"{take.name}{suffix}")
@@ -527,20 +527,20 @@ class OpenServer:
         about = {"take": take.id, "target": str(target), "label": "Exporting"}
         self.workers.submit("look", self._runs.work, (argv,), self._exported, **about)
 
-    def _boxes(self, take: Take) -> Path:
+    def _boxes(self, take: ProjectTake) -> Path:
         return self.project.room(take) / "boxes.json"
 
-    def _head(self, take: Take) -> dict[str, Any]:
+    def _head(self, take: ProjectTake) -> dict[str, Any]:
         """The header of what the page draws; empty before it is there."""
         path = self.project.room(take) / "figure.bin"
         with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
             return json.loads(file.read(int.from_bytes(file.read(4), "little")))
         return {}
 
-    def _home(self, take: Take) -> str:
+    def _home(self, take: ProjectTake) -> str:
         return str(self._head(take).get("home", ".bvh"))
 
-    def _frames(self, take: Take) -> int:
+    def _frames(self, take: ProjectTake) -> int:
         frames = int(self._head(take).get("frames", 0))
         if not frames:
             raise PoiseError("the motion is not read yet", take.name, "Wait a moment", code="not-ready")

@@ -20,7 +20,7 @@ LARGEST = 1 << 30
 
 
 @dataclass(frozen=True)
-class Take:
+class ProjectTake:
     """A motion of a project; nothing writes over it.
 
     Attributes:
@@ -59,7 +59,7 @@ class Project:
     def __init__(self, folder: Path):
         self.folder = folder.absolute()
         self.current = ""
-        self.takes: dict[str, Take] = {}
+        self.takes: dict[str, ProjectTake] = {}
         self._lock = threading.Lock()
         for name in ("files", "takes", "exports"):
             try:
@@ -74,9 +74,9 @@ class Project:
         path = self.folder / FILE
         try:
             held = json.loads(path.read_text(encoding="utf-8"))
-            known = Take.__dataclass_fields__
+            known = ProjectTake.__dataclass_fields__
             rows = [{k: v for k, v in row.items() if k in known} for row in held["takes"]]
-            takes = [Take(**{**row, "says": tuple(row.get("says", ()))}) for row in rows]
+            takes = [ProjectTake(**{**row, "says": tuple(row.get("says", ()))}) for row in rows]
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             hint = "Choose another folder, or put its project.json aside"
             raise PoiseError("is no project of Poise", path, hint, code="not-a-project") from None
@@ -93,15 +93,15 @@ class Project:
             }
             write_json(self.folder / FILE, held)
 
-    def path(self, take: Take) -> Path:
+    def path(self, take: ProjectTake) -> Path:
         """Where its file is."""
         return self.folder / take.file
 
-    def room(self, take: Take) -> Path:
+    def room(self, take: ProjectTake) -> Path:
         """The folder of what is known about it, which can be made again."""
         return self.folder / "takes" / take.id
 
-    def add(self, name: str, path: Path, **more: Any) -> Take:
+    def add(self, name: str, path: Path, **more: Any) -> ProjectTake:
         """A new take, of a file that stays where it is.
 
         Raises:
@@ -113,7 +113,7 @@ class Project:
         path = path.absolute()
         inside = path.relative_to(self.folder) if path.is_relative_to(self.folder) else path
         number = secrets.token_hex(4)
-        take = Take(number, self._free(name), inside.as_posix(), **more)
+        take = ProjectTake(number, self._free(name), inside.as_posix(), **more)
         self.takes[number] = take
         self.room(take).mkdir(parents=True, exist_ok=True)
         return take
@@ -125,12 +125,12 @@ class Project:
         tried = (f"{name} {k}" for k in range(2, MOST + 2))
         return name if name not in held else next(n for n in tried if n not in held)
 
-    def change(self, number: str, **changes: Any) -> Take:
+    def change(self, number: str, **changes: Any) -> ProjectTake:
         """The take with changes."""
         take = self.takes[number] = replace(self.takes[number], **changes)
         return take
 
-    def of_path(self, path: Path) -> Take | None:
+    def of_path(self, path: Path) -> ProjectTake | None:
         """The take that came from a file."""
         same = (t for t in self.takes.values() if not t.parent and self.path(t) == path.absolute())
         return next(same, None)
