@@ -47,7 +47,7 @@ def standing(humanoid: Humanoid, count: int, x: float = 0.0, z: float = 1.0) -> 
     return qpos, torch.zeros(count, model.nv, dtype=torch.float64)
 
 
-def test_bodies_of_two_characters_meet_softly_and_the_floor_as_ever(humanoid: Humanoid) -> None:
+def test_bodies_of_soft_characters_meet_softly_and_the_floor_as_ever(humanoid: Humanoid) -> None:
     """A contact of two characters has an impedance of a half, so that a wedged limb is not torn at."""
 
     def contacts(*characters: Character) -> dict[bool, set[tuple[float, ...]]]:
@@ -63,7 +63,7 @@ def test_bodies_of_two_characters_meet_softly_and_the_floor_as_ever(humanoid: Hu
         return found
 
     alone_ = contacts(Character(humanoid))
-    both = contacts(Character(humanoid, "a"), Character(humanoid, "b"))
+    both = contacts(Character(humanoid, "a"), Character(humanoid, "b", soft=True))
     assert both[True] == alone_[True] and len(both[True]) == 1 and not alone_[False]
     (between,) = both[False]
     assert between[2:4] == (0.5, 0.5)

@@ -30,7 +30,7 @@ from poise.sim.props import Prop
 
 #: Things in one scene; more take minutes to compile and are a mistake.
 MOST = 500
-#: Impedance d of contacts between two characters, see MuJoCo's `solimp`.
+#: Impedance d of contacts between bodies of soft characters, see MuJoCo's `solimp`.
 FLESH = 0.5
 _BITS = ("FOUND", "FORCE", "TORQUE", "POS")
 _DATA = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{bit}")) for bit in _BITS)
@@ -44,10 +44,12 @@ class Character:
     Attributes:
         humanoid: its body.
         name: its bodies, joints and actuators are called NAME/..., or by their own names where it is "".
+        soft: contacts between bodies of characters give way like flesh in its world, see `FLESH`.
     """
 
     humanoid: Humanoid
     name: str = ""
+    soft: bool = False
 
     @property
     def prefix(self) -> str:
@@ -120,7 +122,7 @@ class Scene:
                 add_humanoid(spec, thing.humanoid.table, thing.prefix)
             else:
                 thing.add(spec)
-        if len(characters) > 1:
+        if any(c.soft for c in characters):
             _soften(spec, characters)
         known = [b.name for b in spec.bodies]
         for link in self.links:
@@ -200,7 +202,8 @@ def alone(humanoid: Humanoid, sim: SimConfig | None = None) -> mujoco.MjModel:
 
 
 def _soften(spec: mujoco.MjSpec, characters: tuple[Character, ...]) -> None:
-    """Gives contacts between bodies of characters the impedance `FLESH`; all others keep their own.
+    """Gives contacts between bodies of characters the impedance `FLESH`, also between those of one; all
+    others keep their own.
 
     A limb that is wedged between two of another character has contacts that push against each other. The
     solver shares d / (1 - d) of what both ask for among them: 9 to 19 times with MuJoCo's d, up to

@@ -220,7 +220,7 @@ def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[Sc
             task.task, events=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
         ),
     )
-    rival = Character(task.humanoid, RIVAL)
+    rival = Character(task.humanoid, RIVAL, soft=True)
     return stage._replace(props=(rival,), touches=(*stage.touches, *felt)), task
 
 
