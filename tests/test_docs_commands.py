@@ -85,6 +85,8 @@ def _shortened(line: str) -> list[str]:
             at = argv.index("--seconds")
             del argv[at : at + 2]
         argv += ["--seconds", "3" if "--record" in argv else "0.4", "--port", "0"]
+    if argv[0] == "open":
+        argv += ["--seconds", "0.5", "--port", "0", "--no-browser"]
     if argv[:2] == ["train", "compliant"]:
         argv += ["--iterations", "1", "--envs", "8", "--ppo.horizon", "4", "--threads", "1"]
     if argv[:2] == ["train", "endless"]:
