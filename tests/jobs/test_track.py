@@ -322,11 +322,17 @@ def test_a_hand_leads_as_far_as_it_is_allowed(tracker: Tracker) -> None:
     assert weak.card.help.limit_n == 5.0 and 0.0 < weak.card.help.force_p95_n <= 5.0 * (1 + 1e-5)
     assert strong.card.mpjpe_global_mm < alone.card.mpjpe_global_mm
     (said,) = [n for n in strong.notes if n.startswith("Helped")]
+    assert strong.tracker.policy.num_actions == tracker.policy.num_actions
     assert "up to 2000 N" in said and "of the body's weight" in said
     ahead = track(
-        clip, tracker, controller="lookahead", supports="none", help_limit=50.0,
-        lookahead=LookaheadConfig(candidates=4, smoothing=(0.0,)), threads=1,
-    )  # fmt: skip
+        clip,
+        tracker,
+        controller="lookahead",
+        supports="none",
+        help_limit=50.0,
+        lookahead=LookaheadConfig(candidates=4, smoothing=(0.0,)),
+        threads=1,
+    )
     assert 0.0 < ahead.card.help.force_p95_n <= 50.0 * (1 + 1e-5)
     with refused("single-character-only", says="help is for a single character"):
         TrackConfig(help_limit=10.0, count=2)

@@ -79,7 +79,7 @@ class POISE_OT_open(bpy.types.Operator):  # noqa: N801
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Whether an armature with an action is selected."""
+        """True where an armature with an action is selected."""
         return POISE_OT_run.poll(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:

@@ -92,8 +92,10 @@ def run(
         if 1.5 * loop > seconds:
             raise PoiseError(
                 f"a loop of {loop:g} s is looked for in a longer motion, and this has {seconds:g} s",
-                "--loop", f"Give --seconds {max(60.0, 4 * loop):g}", code="clip-too-short",
-            )  # fmt: skip
+                "--loop",
+                f"Give --seconds {max(60.0, 4 * loop):g}",
+                code="clip-too-short",
+            )
     folder, motion = places(out)
     read = () if seed_clip is None else (seed_clip,)
     may_deliver(folder, motion, force, *read)

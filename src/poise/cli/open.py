@@ -113,7 +113,7 @@ def _family(host: str) -> socket.AddressFamily:
 
 
 def stated(reading: Reading) -> dict[str, Any]:
-    """What is stated of files, by the names of the options, as a project keeps it."""
+    """The user's statements on files, by the names of the options, as a project keeps it."""
     held = {k: v for k, v in vars(reading).items() if v not in (None, False)}
     return {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in held.items()}
 

@@ -470,7 +470,7 @@ class ImitationEnv:
         return self.goal.where(env)
 
     def view(self) -> Frame:
-        """What the terms see of all worlds, from nothing but where they are."""
+        """The frame that terms see of all worlds, from nothing but where they are."""
         return self._terms.frame(self._sources.live(self._told()))
 
     def _told(self, ids: Tensor | None = None, *known: Tensor) -> dict[str, Tensor]:

@@ -299,8 +299,8 @@ class Terms:
                 return plain(dict(zip(names, tensors, strict=True)))
 
             given = tuple(sources.values())
-            # Many worlds are trained, and two threads need a recording. What is called as seldom as
-            # when a motion is tried once is sooner done without: both do the same to the bit.
+            # Many worlds are trained, and two threads need a recording. A program that is called as
+            # seldom as when a motion is tried once is sooner done without: both do the same to the bit.
             now = self._at_once or OFTEN == 1 or 2 * len(sources["age"]) >= MANY
             self._recorded[name] = record(flat, given) if now else Recorded(flat)
         return self._recorded[name](*sources.values())

@@ -161,7 +161,7 @@ class Force(Event):
         return None
 
 
-#: What an event is told of the worlds that it happens to, such as a goal and a backend.
+#: The things that an event is told of the worlds in which it happens, such as a goal and a backend.
 Worlds = TypeVarTuple("Worlds")
 
 

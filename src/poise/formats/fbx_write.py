@@ -19,7 +19,7 @@ from poise.version import __version__
 #: Ticks of a second; centimetres of a metre; the version of the format.
 TICKS, CM, VERSION = 46_186_158_000, 100.0, 7400
 _MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
-#: What ends a file: marks that readers look for.
+#: The end of a file: marks that readers look for.
 _FOOT = (
     bytes.fromhex("fabcab09d0c8d466b1769d836eb5e22d"),
     bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b"),

@@ -237,7 +237,7 @@ def cut_loop(
     joins, wanted = max(2, round(JOINS_S * fps)), seconds * fps
     near = _from_root(clip, pos)
     speed = np.gradient(near, 1.0 / fps, axis=0) * SPEED_S
-    # What the root does on the floor is no difference of places, but one of speeds.
+    # The root's way on the floor is no difference of places, but one of speeds.
     way = np.gradient(clip.root_pos, 1.0 / fps, axis=0)
     turn = quat_conj(heading_quat(torch.tensor(clip.rot[:, 0])))
     speed += (quat_rotate(turn, torch.tensor(way)).numpy() * SPEED_S)[:, None]
@@ -259,8 +259,10 @@ def cut_loop(
     if best is None:
         raise PoiseError(
             f"the motion of {clip.frames / fps:.1f} s holds no {seconds:g} s in a row for a loop",
-            clip.name, "Make a longer one, or ask for a shorter loop", code="clip-too-short",
-        )  # fmt: skip
+            clip.name,
+            "Make a longer one, or ask for a shorter loop",
+            code="clip-too-short",
+        )
     _, i, j = best
     here, before = np.arange(i, j + 1), np.arange(j - joins, j + 1) - (j - i)
     first, last = (torch.tensor(clip.rot[k, 0]) for k in (i, j))

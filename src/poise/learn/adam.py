@@ -51,8 +51,9 @@ class Adam:
             {**plain, **group, "params": list(group["params"])} for group in groups
         ]
         self.betas, self.eps, self.amsgrad = betas, eps, amsgrad
-        # The kernel is no promise of torch's.
-        self.fused = fused and not amsgrad and hasattr(torch, "_fused_adam_")
+        # The kernels are no promise of torch's.
+        kernels = ("_fused_adam_", "_fused_adamw_", "_foreach_add_")
+        self.fused = fused and not amsgrad and all(hasattr(torch, name) for name in kernels)
         self.state: dict[Tensor, dict[str, Tensor]] = {}
 
     def zero_grad(self, set_to_none: bool = True) -> None:

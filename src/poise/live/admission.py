@@ -1,4 +1,4 @@
-"""What is let in: addresses, origins and tokens, how many connections, which messages."""
+"""A guard at the door of a server: it minds addresses, origins, tokens, connections and messages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ EACH, ALL, RATE, BURST = 16, 64, 240.0, 480.0
 
 @dataclass(eq=False)
 class Guard:
-    """What is let in.
+    """Connections and requests that are let in.
 
     Attributes:
         host: the address that is listened on.
@@ -124,7 +124,7 @@ class Bucket:
         self._left, self._at = BURST, time.monotonic()
 
     def takes(self) -> bool:
-        """Whether one more may come now."""
+        """True if one more may come now."""
         now = time.monotonic()
         self._left = min(BURST, self._left + RATE * (now - self._at))
         self._at = now

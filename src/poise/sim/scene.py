@@ -258,7 +258,7 @@ def mjcf_of(humanoid: Humanoid, sim: SimConfig | None = None) -> str:
     sim: the physics; by default those of the recipes. A control step is `sim.substeps` of MuJoCo's.
     """
     spec = Scene((Character(humanoid),), sim=sim or SimConfig()).spec
-    # What is written is complete only after it was compiled.
+    # The text is complete only after the model was compiled.
     spec.compile()
     return spec.to_xml()
 

@@ -79,7 +79,7 @@ def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFi
 
 
 def same_library(was: Sequence[str], now: Sequence[str], clips: Iterable[str]) -> bool:
-    """Whether a run's library is the one that is stated now, also where it was moved since.
+    """True if a run's library is the one that is stated now, also where it was moved since.
 
     A folder or file that is no longer where it was is known again: a folder by the files that the run's
     clips are from, wherever it is now and however it is called; another file, "onto FILE", by its name.

@@ -142,6 +142,7 @@ class TrackSession:
         goals: `(T, B, 3)` m, where the bodies are to be, before anything pushes or leads.
         supports: what the motion rests on.
         led, apart: a character that was led along its motions, and the motions each for itself.
+        actor: the policy as it acts in the task, where that is not the tracker.
         do: how the task is done; by default `done_by`.
         done: how it was done.
     """
@@ -161,6 +162,7 @@ class TrackSession:
     supports: tuple[Support, ...] = ()
     led: RecoveryRun | None = None
     apart: Reference = field(init=False)
+    actor: Tracker | None = None
     do: Callable[..., tuple[TrackingRun, Sequence[str]]] | None = None
     done: TrackingRun = field(init=False)
     notes: list[str] = field(default_factory=list[str])
@@ -184,7 +186,7 @@ class TrackSession:
             self.given[0], imitation.humanoid.table, ref.frames, ref.rate_hz
         )
         do = self.do or done_by
-        self.done, said = do(tracker, imitation, config, hold, self.show, prices)
+        self.done, said = do(self.actor or tracker, imitation, config, hold, self.show, prices)
         notes, about, done = [*self.notes, *said], tracker.about, self.done
         suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
         rollouts = done.rollouts
@@ -287,11 +289,12 @@ def _support(s: TrackSession) -> None:
 
 
 def _help(s: TrackSession) -> None:
-    """A hand leads the root; the policy's own actions have no part in it."""
+    """A hand leads the root; the policy's own actions have no part in it. Elsewhere, such as at another
+    frame rate, the policy goes without."""
     residual = ImplicitResidual(s.config.help_limit, s.config.help_limit)
     hinges = len(s.imitation.humanoid.hinges)
     policy = s.tracker.policy.with_actions(hinges).with_actions(hinges + residual.dims)
-    s.tracker = replace(s.tracker, policy=policy)
+    s.actor = replace(s.tracker, policy=policy)
     own = replace(s.imitation.task, residual=residual, help_by="all")
     s.imitation = with_guide(replace(s.imitation, task=own))
 

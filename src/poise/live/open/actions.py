@@ -107,7 +107,7 @@ EXPORTS = {
     ".npz": "npz (AMASS or Poise)",
     ".csv": "CSV",
 }
-#: What may be stated of a file, by the name of its option.
+#: Statements on a file, by the name of its option.
 READING: dict[str, tuple[str, ...] | None] = {
     "up": ("Y", "Z", "X", "-Y", "-Z", "-X"),
     "unit": None,
@@ -141,7 +141,7 @@ def told() -> list[dict[str, Any]]:
 
 
 def reading_of(given: Any) -> dict[str, Any]:
-    """What is stated of a file, checked.
+    """Statements on a file, checked.
 
     Raises:
         PoiseError: it is none of `READING`, or makes no sense.

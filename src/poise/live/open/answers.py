@@ -32,7 +32,7 @@ def motion_of(outputs: Mapping[str, Any]) -> Path | None:
 
 
 def sentences(action: Action, answer: Mapping[str, Any]) -> list[str]:
-    """What there is to say of a result, most important first."""
+    """Sentences on a result, most important first."""
     result, out = answer.get("result") or {}, list[str]()
     if fixed := result.get("fixed"):
         before, after = len(result.get("faults") or ()), len(fixed.get("faults") or ())

@@ -235,7 +235,7 @@ def _said(path: Path, text: str, share: float | None) -> tuple[str, float | None
 
 
 def _begin(run: Callable[..., None], args: tuple[Any, ...], folder: str) -> None:
-    """What a process does: nothing of it is printed where the server was started."""
+    """The work of a process: nothing of it is printed where the server was started."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         out = os.open(Path(folder) / OUT, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)

@@ -1,4 +1,4 @@
-"""What the page shows of a clip: places of its joints, faults, guesses, contacts, what it rests on."""
+"""A clip as the page shows it: places of its joints, faults, guesses, contacts, what it rests on."""
 
 from __future__ import annotations
 
@@ -147,8 +147,8 @@ FIGURE, JUDGED = "figure.bin", "judged.json"
 
 
 def rests_of(clip: Clip) -> list[dict[str, Any]]:
-    """What a motion rests on, found as `poise track` does it before it simulates, in the world of the
-    clip: see `kinematics.supports.Support`."""
+    """The boxes that a motion rests on, found as `poise track` does it before it simulates, in the world
+    of the clip: see `kinematics.supports.Support`."""
     from poise.jobs.open import open_run
     from poise.jobs.track.surroundings import at_home
     from poise.jobs.track.tracking import FEATURES, TrackConfig, TrackSession

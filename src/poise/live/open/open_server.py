@@ -37,7 +37,7 @@ from poise.live.open.project import LARGEST, Project, ProjectTake, clean_name, s
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, Content, WebServer
 
 SCRIPTS = ("figure", "stage_view", "timeline", "forms", "open")
-#: What can be fetched beside what belongs to takes.
+#: Files that can be fetched beside those of takes.
 PAGES: dict[str, Asset] = {
     "/": ("live.open", "open.html", HTML),
     "/open.css": ("live.open", "open.css", CSS),
@@ -62,7 +62,7 @@ _FETCHED = re.compile(r"/(figure|judged|report|export)/([0-9a-z]{1,16})")
 
 @dataclass(frozen=True)
 class Runs:
-    """What runs in processes of their own; each is known by its import path there.
+    """Functions that run in processes of their own; each is known by its import path there.
 
     Attributes:
         work: a command line; its JSON goes to stdout.
@@ -109,7 +109,7 @@ class OpenServer:
 
     @property
     def url(self) -> str:
-        """Where the page is, with the token."""
+        """The address of the page, with the token."""
         return self._web.url
 
     def close(self) -> None:
@@ -259,7 +259,7 @@ class OpenServer:
         }
 
     def _stands(self, take: ProjectTake) -> list[dict[str, Any]]:
-        """What a body that did a motion stood, sat or leaned on."""
+        """The boxes on which a body that did a motion stood, sat or leaned."""
         if take.result and take.id not in self._stood:
             try:
                 text = (self.project.folder / take.result / "supports.json").read_text(encoding="utf-8")
@@ -506,7 +506,7 @@ class OpenServer:
         shown = [_short(w, self.project.folder) for w in shown]
         named = name if action.folder else f"{name}{suffix}"
         came = Path(path)
-        # What was made here bears the name of its motion for people.
+        # A motion that was made here bears the name of its motion for people.
         read_from = safe_file(f"{source.name}{came.suffix}") if source.parent else came.name
         return argv, shlex.join(["poise", action.verb, read_from, *shown, "-o", named])
 
@@ -548,7 +548,7 @@ class OpenServer:
 
 
 async def _received(connection: ServerConnection, part: Path, size: int) -> bool:
-    """Whether a file came whole."""
+    """Receives a file; true if it came whole."""
     came = 0
     with part.open("xb") as file:
         while came < size:

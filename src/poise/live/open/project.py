@@ -94,7 +94,7 @@ class Project:
             write_json(self.folder / FILE, held)
 
     def path(self, take: ProjectTake) -> Path:
-        """Where its file is."""
+        """The path of its file."""
         return self.folder / take.file
 
     def room(self, take: ProjectTake) -> Path:

@@ -17,7 +17,7 @@ from poise.live.protocol import command
 from poise.live.sources import JsonStream, Takes
 from poise.live.stream import Inbox
 
-#: What can be fetched.
+#: Files that can be fetched.
 PAGES: dict[str, Asset] = {
     "/": ("live.page", "live.html", HTML),
     "/live.js": ("live.page", "live.js", JS),
@@ -68,7 +68,7 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """Where the page is, with the token."""
+        """The address of the page, with the token."""
         return self._web.url
 
     def publish(self, frame: bytes, text: Callable[[], str] | str) -> None:

@@ -38,7 +38,7 @@ TOLD = 50
 
 
 class Content(NamedTuple):
-    """What is sent for a path that is no page: bytes, their type, the name as which a browser keeps them
+    """An answer for a path that is no page: bytes, their type, the name as which a browser keeps them
     ("" shows them), and a policy in place of the pages' own."""
 
     body: bytes
@@ -90,7 +90,7 @@ class WebServer:
 
     @property
     def url(self) -> str:
-        """Where the page is, with the token."""
+        """The address of the page, with the token."""
         host = f"[{self.guard.host}]" if ":" in self.guard.host else self.guard.host
         more = f"?token={self.guard.token}" if self.guard.token else ""
         return f"http://{host}:{self.guard.port}/{more}"
@@ -115,11 +115,22 @@ class WebServer:
         self._loop.set_exception_handler(pauses)
         try:
             server: Server = await serve(
-                self._handle, sock=GuardedSocket(guard), backlog=WAITING, process_request=self._answer,
-                create_connection=kind, max_size=self._most, max_queue=64, write_limit=65_536,
-                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=60,
-                compression=None, server_header=None, logger=_quiet(),
-            )  # fmt: skip
+                self._handle,
+                sock=GuardedSocket(guard),
+                backlog=WAITING,
+                process_request=self._answer,
+                create_connection=kind,
+                max_size=self._most,
+                max_queue=64,
+                write_limit=65_536,
+                open_timeout=HANDSHAKE_S,
+                close_timeout=1,
+                ping_interval=20,
+                ping_timeout=60,
+                compression=None,
+                server_header=None,
+                logger=_quiet(),
+            )
         except OSError as problem:
             self._problem = problem.strerror or str(problem)
             self._ready.set()
