@@ -365,8 +365,10 @@ class CharacterGoals:
         near: the person where it stands, to which the character gets up if that is near.
         """
         self._grace = max(0, self._grace - 1)
-        down = bool(self.get_up.lies(body.qpos))
         off = body.off_m > LOST and not self._grace
+        if not off and self.doing not in (FALLS, RETURNS):
+            return False
+        down = bool(self.get_up.lies(body.qpos))
         given = (torch.tensor([x]) for x in (off, body.speed, down, self._way.over))
         lost, rests, back = (bool(x) for x in self._phases.watch(*given))
         if lost:
