@@ -35,10 +35,20 @@ def arguments() -> argparse.ArgumentParser:
         "--compare", action="store_true", help="write nothing; tell figures beside those there"
     )
     p.add_argument("--workers", type=int, default=0, help="processes; by default one a core")
-    p.add_argument("--data", type=Path, default=Path(os.environ.get("POISE_DATA") or cache / "data"),
-                   metavar="FOLDER", help="the development set")  # fmt: skip
-    p.add_argument("--library", type=Path, default=cache / "library", metavar="FOLDER",
-                   help="the training library, see training/README.md")  # fmt: skip
+    p.add_argument(
+        "--data",
+        type=Path,
+        default=Path(os.environ.get("POISE_DATA") or cache / "data"),
+        metavar="FOLDER",
+        help="the development set",
+    )
+    p.add_argument(
+        "--library",
+        type=Path,
+        default=cache / "library",
+        metavar="FOLDER",
+        help="the training library, see training/README.md",
+    )
     p.add_argument("--work", type=Path, default=ROOT / "runs/benchmarks", metavar="FOLDER")
     p.add_argument("--results", type=Path, default=None, metavar="FOLDER", help="of the tables")
     return p

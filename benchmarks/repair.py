@@ -52,10 +52,17 @@ from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
 COLUMNS = ("subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command")
 #: Clips that the repair was made with, which are not measured.
 KNOWN = (
-    "dataset-1_walk_normal_001", "dataset-1_run_normal_001", "dataset-1_kick_normal_001",
-    "dataset-1_bow_normal_001", "dataset-1_punch_normal_001", "dataset-1_dash_normal_001",
-    "02_01", "02_04", "08_02", "35_17",
-)  # fmt: skip
+    "dataset-1_walk_normal_001",
+    "dataset-1_run_normal_001",
+    "dataset-1_kick_normal_001",
+    "dataset-1_bow_normal_001",
+    "dataset-1_punch_normal_001",
+    "dataset-1_dash_normal_001",
+    "02_01",
+    "02_04",
+    "08_02",
+    "35_17",
+)
 SIZES_MM, LONGEST_S, SHORTEST_S, CLIPS = (10.0, 25.0, 50.0, 100.0), 10.0, 1.5, 40
 #: A truth has no faults where a repair moves it by less than this (mm); recordings that are repaired as
 #: they are, and dirty ones that are tracked.

@@ -21,9 +21,11 @@ from poise.kinematics.repair.motion_doctor import READ_ONLY
 from poise.motion import Clip
 
 FILES = (
-    "noisy/pose2sim/*/*.trc", "noisy/rokoko_video/*.bvh", "kimodo/*.npz",
+    "noisy/pose2sim/*/*.trc",
+    "noisy/rokoko_video/*.bvh",
+    "kimodo/*.npz",
     "other/text_to_motion/*.npy",
-)  # fmt: skip
+)
 #: Motions that are read of a file that holds many.
 TAKES = 10
 FIGURES = ("sole_slide_mm_per_s", "jerk_m_per_s3")

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import torch
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 
 from poise.body import find_anatomy
@@ -87,8 +86,8 @@ def foot_lock(clip: Clip, truth: Clip) -> Clip | None:
             fade = np.linspace(1.0, 0.0, frames + 2)[1:-1, None] * shift[last + 1]
             after = shift[last + 2 : last + 2 + frames]
             after[:] = fade[: len(after)]
-        none = torch.zeros(clip.frames, dtype=torch.float64)
-        axis = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand(clip.frames, 3)
-        leads[foot] = Lead(torch.tensor(shift), none, none, axis)
-    root, rot = clip.tensors()
-    return clip.replaced(rot=led(clip.skeleton, rot, root, leads).numpy())
+        none = np.zeros(clip.frames)
+        axis = np.tile([0.0, 1.0, 0.0], (clip.frames, 1))
+        leads[foot] = Lead(shift, none, none, axis)
+    root, rot = clip.arrays()
+    return clip.replaced(rot=led(clip.skeleton, rot, root, leads))

@@ -101,14 +101,16 @@ def _parser(verb: str) -> tuple[str, dict[str, str]]:
     from poise.cli import parse
 
     options = parse.options_of(import_module(f"poise.cli.{verb}"))
-    with warnings.catch_warnings(), parse._whole_lines(""):  # pyright: ignore[reportPrivateUsage]
+    with warnings.catch_warnings(), parse.whole_lines(""):
         warnings.simplefilter("ignore")
         made = tyro.extras.get_parser(
             options, prog=f"poise {verb}", config=(tyro.conf.FlagCreatePairsOff,)
         )
     groups: dict[str, str] = {}
-    for group in made._action_groups:
-        rows = [row for a in group._group_actions if (row := _option(a))]  # pyright: ignore[reportPrivateUsage]
+    # The groups of argparse's parsers have no public name.
+    for group in made._action_groups:  # noqa: SLF001
+        actions = group._group_actions  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
+        rows = [row for a in actions if (row := _option(a))]
         if rows:
             title = "options" if group.title in ("positional arguments", "options") else str(group.title)
             head = groups.get(title, "| option | |\n|---|---|")

@@ -154,7 +154,8 @@ def motion(name: str, tracker: Tracker) -> Clip:
         held = next((k.hands[sign] for k in keys if k.hands[sign] is not None), None)
         if held is not None:
             targets[hand] = now[:, hand] + share * (torch.tensor(held) - now[:, hand])
-    rot = match_positions(skeleton, rot, root, targets)
+    goals = {j: goal.numpy() for j, goal in targets.items()}
+    rot = torch.from_numpy(match_positions(skeleton, rot.numpy(), root.numpy(), goals))
     for foot, wanted in feet.items():
         _, world = forward_kinematics(skeleton.parents, offsets, root, rot)
         above = world[:, skeleton.parents[foot]]

@@ -94,7 +94,7 @@ def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from poise.formats import read_clip
     from poise.learn.inbetween_model import MODEL, InbetweenModel, make_net, save_model
     from poise.learn.transition import SkeletonLayout
-    from poise.motion.windows import pack_frames
+    from poise.synthesis.windows import pack_frames
     from toy_windows import SMALL
 
     bank = pack_frames([read_clip(WALK)])

@@ -6,7 +6,6 @@ import math
 from functools import cache
 
 import numpy as np
-import torch
 
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate, rotvec_to_quat, unwrap_quats
@@ -40,9 +39,9 @@ def human(scale: float = 1.0) -> Skeleton:
     return Skeleton(tuple(names), tuple(parents), offsets, ends)
 
 
-def turn(axis: str, angle: torch.Tensor) -> torch.Tensor:
+def turn(axis: str, angle: np.ndarray) -> np.ndarray:
     """wxyz of turns by `angle (T)` rad about one axis letter."""
-    return euler_to_quat(angle.unsqueeze(-1), axis)
+    return euler_to_quat(angle[..., None], axis)
 
 
 def swing(
@@ -60,9 +59,9 @@ def swing(
     """
     skeleton = human(scale)
     frames = round(seconds * fps) + 1
-    t = torch.linspace(0, 1, frames, dtype=torch.float64)
-    wave = torch.sin(2 * math.pi * t)
-    rot = torch.zeros(frames, len(skeleton), 4, dtype=torch.float64)
+    t = np.linspace(0, 1, frames)
+    wave = np.sin(2 * math.pi * t)
+    rot = np.zeros((frames, len(skeleton), 4))
     rot[..., 0] = 1.0
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         arm = quat_mul(turn("Y", -0.5 * sign * wave), turn("X", sign * (0.2 + 0.1 * wave)))
@@ -73,15 +72,15 @@ def swing(
     rot[:, skeleton.index("Spine")] = turn("Z", 0.1 * wave)
     heading = turn("Z", bend * t)
     rot[:, 0] = quat_mul(heading, turn("X", 0.05 * wave))
-    step = torch.tensor([speed / fps, 0.0, 0.0], dtype=torch.float64)
-    path = torch.cumsum(quat_rotate(heading, step.expand(frames, 3)), 0)
+    step = np.array([speed / fps, 0.0, 0.0], dtype=float)
+    path = np.cumsum(quat_rotate(heading, np.broadcast_to(step, (frames, 3))), 0)
     path = path - path[:1]
     path[:, 2] = 0.9 * scale
-    return Clip(skeleton, path.numpy(), rot.numpy(), fps, name, cyclic)
+    return Clip(skeleton, path, rot, fps, name, cyclic)
 
 
 def trembling(clip: Clip, rad: float = 0.06, seed: int = 0) -> Clip:
     """The clip with white noise of deviation `rad` about the axes of all its joints."""
     turn = rad * np.random.default_rng(seed).standard_normal((clip.frames, len(clip.skeleton), 3))
-    rot = quat_mul(torch.tensor(clip.rot), rotvec_to_quat(torch.tensor(turn)))
-    return clip.replaced(rot=unwrap_quats(rot).numpy())
+    rot = quat_mul(clip.rot, rotvec_to_quat(turn))
+    return clip.replaced(rot=unwrap_quats(rot))

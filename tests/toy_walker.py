@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from poise.kinematics.limbs import match_positions
 from poise.motion import Clip
@@ -57,7 +56,7 @@ def walker(
     """
     skeleton, frames = human(), round(period * periods * fps) + 1
     t = np.arange(frames) / fps
-    rot = torch.zeros(frames, len(skeleton), 4, dtype=torch.float64)
+    rot = np.zeros((frames, len(skeleton), 4))
     rot[..., 0] = 1.0
     # Bent knees, which tell the leg's plane.
     for side in ("Left", "Right"):
@@ -65,14 +64,14 @@ def walker(
         for joint, angle in (("UpLeg", -bend), ("Leg", 2 * bend), ("Foot", -bend)):
             j = skeleton.index(side + joint)
             rot[:, j, 0], rot[:, j, 2] = np.cos(angle / 2), np.sin(angle / 2)
-    root = torch.zeros(frames, 3, dtype=torch.float64)
+    root = np.zeros((frames, 3))
     root[:, 2] = PELVIS_M
-    goals: dict[int | str, torch.Tensor] = {}
+    goals: dict[int | str, np.ndarray] = {}
     for side, sign, phase in (("Left", 1.0, 0.0), ("Right", -1.0, 0.5)):
         path = foot_path(t + phase * period, period, duty, speed, turning, rise, 0.1 * sign, lift)
-        goals[skeleton.index(f"{side}Foot")] = torch.tensor(path)
+        goals[skeleton.index(f"{side}Foot")] = path
     out = match_positions(skeleton, rot, root, goals)
-    offsets = torch.tensor(skeleton.offsets)
+    offsets = skeleton.offsets
     quat = forward_kinematics(skeleton.parents, offsets, root, out)[1]
     for joint in goals:
         assert isinstance(joint, int)
@@ -81,6 +80,6 @@ def walker(
         bears = duty * period
         share = np.clip((tau - bears) / (period - bears), 0, 1)
         yaw = -turning * (np.clip(tau, 0, bears) - 0.5 * bears - bears * share**2 * (3 - 2 * share))
-        flat = euler_to_quat(torch.tensor(yaw)[:, None], "Z")
+        flat = euler_to_quat(yaw[:, None], "Z")
         out[:, joint] = quat_mul(out[:, joint], quat_between(quat[:, joint], flat))
-    return Clip(skeleton, root.numpy(), out.numpy(), fps, name)
+    return Clip(skeleton, root, out, fps, name)

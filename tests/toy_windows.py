@@ -9,8 +9,8 @@ import torch
 from poise.learn.between import BetweenConfig
 from poise.learn.transition import Known, SkeletonLayout
 from poise.learn.window_sampler import FrameData
-from poise.motion.windows import FrameBank, pack_frames, step_contacts, train_statistics
 from poise.papers.skeleton2humanoid.rtn import RTNConfig
+from poise.synthesis.windows import FrameBank, pack_frames, step_contacts, train_statistics
 from toy_human import swing
 
 SMALL = BetweenConfig(width=32, layers=2, heads=2, feedforward=48, latent=3)

@@ -54,9 +54,15 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
     motions, config = begin(
-        args.out, args.library, open_run(None).tracker, settings(args), hold_out=HELD_OUT,
-        leave_out=TWINS, reading=LibraryConfig(rates=SIXTY, mirror=True), tell=print,
-    )  # fmt: skip
+        args.out,
+        args.library,
+        open_run(None).tracker,
+        settings(args),
+        hold_out=HELD_OUT,
+        leave_out=TWINS,
+        reading=LibraryConfig(rates=SIXTY, mirror=True),
+        tell=print,
+    )
     labels = read_labels(Path(__file__).with_name("generator_labels.txt"))
     model, _, _ = train_generator(motions, args.out, config, args.minutes, shown, labels)
     model.save(args.out / "shipped.safetensors", half=True)

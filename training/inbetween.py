@@ -46,13 +46,19 @@ def config_of(
     out."""
     stated = tuple((a, b) for a, b in (pair.split("=", 1) for pair in skeletons))
     return Inbetween(
-        name="CMU", final=FINAL, validation=VALIDATION,
+        name="CMU",
+        final=FINAL,
+        validation=VALIDATION,
         # By steps alone feet would stand in 18 % of the frames, and none would be held.
         contacts="floor",
-        mirror=True, stretch=1.3, seed=seed, onto=str(onto),
+        mirror=True,
+        stretch=1.3,
+        seed=seed,
+        onto=str(onto),
         reading=LibraryConfig(rates=RATES, skeletons=stated, leave_out=(*SAME_TAKES, *never)),
-        between=SIZES, between_training=TRAINING,
-    )  # fmt: skip
+        between=SIZES,
+        between_training=TRAINING,
+    )
 
 
 def shown(stats: BlockStats) -> None:

@@ -48,9 +48,14 @@ class Lessons:
     """
 
     def __init__(
-        self, env: ImitationEnv, pupil: PolicyBundle, teachers: Sequence[PolicyBundle], hard: Tensor,
-        noise: Tensor, seed: int,
-    ):  # fmt: skip
+        self,
+        env: ImitationEnv,
+        pupil: PolicyBundle,
+        teachers: Sequence[PolicyBundle],
+        hard: Tensor,
+        noise: Tensor,
+        seed: int,
+    ):
         self.env, self.pupil, self.teachers = env, pupil, teachers
         self.hard, self.noise = hard, noise
         self.rng = torch.Generator().manual_seed(seed)

@@ -55,19 +55,39 @@ class ClipSet:
 SETS = {
     s.name: s
     for s in (
-        ClipSet("bandai", "Bandai, never learned (validation)", "validation",
-                "other/bandai_bvh/*.bvh", STYLES),
-        ClipSet("bandai-test", "Bandai, four styles never looked at (test)", "test",
-                "other/bandai_bvh/*.bvh", (), STYLES),
-        ClipSet("held-out", "held-out CMU subjects 05, 11, 14", "test",
-                "cmu_amc/rfc/05_*.amc cmu_amc/11/11_*.amc cmu_bvh/ad/14_14.bvh"),
+        ClipSet(
+            "bandai",
+            "Bandai, never learned (validation)",
+            "validation",
+            "other/bandai_bvh/*.bvh",
+            STYLES,
+        ),
+        ClipSet(
+            "bandai-test",
+            "Bandai, four styles never looked at (test)",
+            "test",
+            "other/bandai_bvh/*.bvh",
+            (),
+            STYLES,
+        ),
+        ClipSet(
+            "held-out",
+            "held-out CMU subjects 05, 11, 14",
+            "test",
+            "cmu_amc/rfc/05_*.amc cmu_amc/11/11_*.amc cmu_bvh/ad/14_14.bvh",
+        ),
         ClipSet("library", "recordings and their retimed copies, learned", "known"),
         ClipSet("copies", "mirrored and backwards copies, learned", "known"),
-        ClipSet("salsa", "salsa, partners of dancers that were learned", "validation",
-                "cmu_bvh/acrnn_salsa/*.bvh", tuple(f"/{k:02d}.bvh" for k in (*range(1, 8), 9, 10, 12))),
-        ClipSet("estimators", "files of real pose estimators", "validation", "noisy/*")
+        ClipSet(
+            "salsa",
+            "salsa, partners of dancers that were learned",
+            "validation",
+            "cmu_bvh/acrnn_salsa/*.bvh",
+            tuple(f"/{k:02d}.bvh" for k in (*range(1, 8), 9, 10, 12)),
+        ),
+        ClipSet("estimators", "files of real pose estimators", "validation", "noisy/*"),
     )
-}  # fmt: skip
+}
 
 #: Clips of which each is imitated by itself: file, skeleton, frames/s where the file's are wrong, title.
 #: In flight 90_08 and 90_11 fall with four times gravity at 120 frames per second, with gravity at 60.
@@ -177,13 +197,21 @@ def _holds(path: str, words: Sequence[str]) -> bool:
 def library(places: Places, name: str) -> dict[str, Clip]:
     """Clips of the training library as the tracker learns them: recordings, or copies made of them."""
     tracker = open_run(None).tracker
-    how = LibraryConfig(rates=SIXTY, leave_out=TWINS, mirror=name == "copies",
-                        backwards=BACKWARDS if name == "copies" else ())  # fmt: skip
+    how = LibraryConfig(
+        rates=SIXTY,
+        leave_out=TWINS,
+        mirror=name == "copies",
+        backwards=BACKWARDS if name == "copies" else (),
+    )
     found, _ = library_of(
-        places.library, tracker.target, tracker.config.sim.control_hz, config=how,
+        places.library,
+        tracker.target,
+        tracker.config.sim.control_hz,
+        config=how,
         body=tracker.config.body if isinstance(tracker.config.body, BodyConfig) else BodyConfig(),
-        cache=places.work / "cache", tell=print
-    )  # fmt: skip
+        cache=places.work / "cache",
+        tell=print,
+    )
     out = {}
     for c in found:
         made = c.name.endswith((MIRRORED, IS_BACKWARDS))

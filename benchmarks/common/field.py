@@ -56,12 +56,15 @@ def episodes(r: RolloutSet, trial: int = 0) -> list[Episode]:
     won, lengths = under_rules(r), r.lengths.tolist()
     return [
         {
-            "clip": r.clip_name(int(r.clip[e])), "trial": trial, "frames": lengths[e],
-            "tracked": int(mask[e].sum()), "won": {rule: bool(w[e]) for rule, w in won.items()},
-            "sums": {k: [float(s.total[e]), int(s.count[e])] for k, s in sums.items()}
+            "clip": r.clip_name(int(r.clip[e])),
+            "trial": trial,
+            "frames": lengths[e],
+            "tracked": int(mask[e].sum()),
+            "won": {rule: bool(w[e]) for rule, w in won.items()},
+            "sums": {k: [float(s.total[e]), int(s.count[e])] for k, s in sums.items()},
         }
         for e in range(len(r.clip))
-    ]  # fmt: skip
+    ]
 
 
 def pooled(rows: Iterable[Episode], figure: str) -> float:

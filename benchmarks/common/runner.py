@@ -67,10 +67,22 @@ class Part:
 SUITES = {
     name: f"benchmarks.suites.{name.replace('-', '_')}"
     for name in (
-        "engine", "gpu", "read", "attack", "retarget-repair", "track", "lookahead-search", "recover",
-        "imitate", "inbetween-complete", "dream", "scenes", "live", "papers"
+        "engine",
+        "gpu",
+        "read",
+        "attack",
+        "retarget-repair",
+        "track",
+        "lookahead-search",
+        "recover",
+        "imitate",
+        "inbetween-complete",
+        "dream",
+        "scenes",
+        "live",
+        "papers",
     )
-}  # fmt: skip
+}
 
 
 def parts_of(suite: str) -> dict[str, Part]:
@@ -190,8 +202,9 @@ def chosen(suite: str, only: Sequence[str]) -> dict[str, Part]:
     for name in only:
         if not any(p.startswith(name) for p in parts):
             known = ", ".join(parts)
-            raise PoiseError(f"no part of {suite} is called '{name}'", hint=f"Parts: {known}",
-                             code="unknown-choice")  # fmt: skip
+            raise PoiseError(
+                f"no part of {suite} is called '{name}'", hint=f"Parts: {known}", code="unknown-choice"
+            )
     # The whole name of a part is that part alone, also where others begin so.
     whole = {name for name in only if name in parts}
     begun = tuple(name for name in only if name not in parts)
@@ -216,8 +229,21 @@ def rows_of(suite: str, name: str, part: Part, places: Places, store: Store) -> 
     out = []
     for f in part.rows(places, raws):
         told = policy if f.policy is None else f.policy
-        out.append(Row(f.subject, f.metric, short(f.value), f.spread, str(f.n), str(f.seeds), told,
-                       commit(), command_of(suite, name), hours, where))  # fmt: skip
+        out.append(
+            Row(
+                f.subject,
+                f.metric,
+                short(f.value),
+                f.spread,
+                str(f.n),
+                str(f.seeds),
+                told,
+                commit(),
+                command_of(suite, name),
+                hours,
+                where,
+            )
+        )
     return out
 
 
@@ -275,9 +301,14 @@ def run(
 
 
 def _measure(
-    suite: str, name: str, part: Part, places: Places, store: Store, workers: int,
-    tell: Callable[[str], None]
-) -> None:  # fmt: skip
+    suite: str,
+    name: str,
+    part: Part,
+    places: Places,
+    store: Store,
+    workers: int,
+    tell: Callable[[str], None],
+) -> None:
     left = [u for u in part.units(places) if (name, u) not in store.raws]
     if not left:
         return

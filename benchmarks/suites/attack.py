@@ -95,9 +95,16 @@ def outcome(name: str) -> dict[str, Any]:
     small = memory < max(BYTES, 4 * size + 200e6)
     fine = kind in ("read", "refused") and len(said) < 310 and quick and small
     wall = time.monotonic() - begun
-    return {"what": name, "outcome": kind, "said": said, "cpu_s": round(seconds, 1),
-            "wall_s": round(wall, 1), "peak_mb": round(memory / 1e6), "file_mb": round(size / 1e6, 1),
-            "ok": fine}  # fmt: skip
+    return {
+        "what": name,
+        "outcome": kind,
+        "said": said,
+        "cpu_s": round(seconds, 1),
+        "wall_s": round(wall, 1),
+        "peak_mb": round(memory / 1e6),
+        "file_mb": round(size / 1e6, 1),
+        "ok": fine,
+    }
 
 
 # --- kills ------------------------------------------------------------------------------------------
@@ -144,9 +151,11 @@ def tiny_perpetual() -> None:
 
     ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
     own: dict[str, Any] = {
-        "ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None,
-        "recovering": RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2))
-    }  # fmt: skip
+        "ppo": ppo,
+        "clone": CloneConfig(steps=4, rounds=0, critic_steps=4),
+        "style": None,
+        "recovering": RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2)),
+    }
     train_perpetual.recipe = lambda additive: StagedPerpetual(**own)
 
 
@@ -154,15 +163,15 @@ def command_of(recipe: str, here: Path, out: Path) -> list[str]:
     """The miniature of a recipe."""
     few = ["--threads", "1", "-o", str(out)]
     library = ["--library", str(here / "clips")]
+    perpetual = ["--envs", "8", "--iterations", "6", "--max-primitives", "2"]
+    inbetween = ["--iterations", "200", "--config", str(here / "inbetween.toml")]
+    endless = ["--iterations", "400", "--config", str(here / "endless.toml")]
     return {
         "imitate": ["imitate", str(here / "short.bvh"), "--iterations", "6", "--envs", "16", *few],
-        "perpetual": ["train", "perpetual", *library, "--envs", "8", "--iterations", "6",
-                      "--max-primitives", "2", *few],
-        "inbetween": ["train", "inbetween", *library, "--iterations", "200",
-                      "--config", str(here / "inbetween.toml"), *few],
-        "endless": ["train", "endless", *library, "--iterations", "400",
-                    "--config", str(here / "endless.toml"), *few]
-    }[recipe]  # fmt: skip
+        "perpetual": ["train", "perpetual", *library, *perpetual, *few],
+        "inbetween": ["train", "inbetween", *library, *inbetween, *few],
+        "endless": ["train", "endless", *library, *endless, *few],
+    }[recipe]
 
 
 def miniature_of(argv: list[str], log: Path) -> None:

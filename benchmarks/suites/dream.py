@@ -172,9 +172,15 @@ def rollouts(
     begins = [made.begin(1, torch.Generator().manual_seed(k)) for k in range(count)]
     wishing = made.wishing(0.0 if targets else label_seconds, count)
     motion = GeneratorGoal(
-        wishing, tracker.humanoid, rate, count, lead=max(*tracker.config.window, 1) + 1,
-        pasts=torch.cat(begins), steering=Steering(targets), simulated=past == "simulated",
-    )  # fmt: skip
+        wishing,
+        tracker.humanoid,
+        rate,
+        count,
+        lead=max(*tracker.config.window, 1) + 1,
+        pasts=torch.cat(begins),
+        steering=Steering(targets),
+        simulated=past == "simulated",
+    )
     goal = Recovering(motion, tracker.recovery_clips if recover else None)
     goal.reset(torch.arange(count))
     width = tracker.humanoid.model.nq
@@ -244,10 +250,15 @@ def went(made: Rollouts, world: int, seconds: float, recover: bool = True) -> di
     seen = sorted(visited(humanoid, model.seeds, done, fps))
     kinds = set[int]() if model.kinds is None else set(model.kinds[seen].tolist())
     return {
-        "counted_s": until, "falls": len(falls), "away_s": away, "stayed_down": int(down),
-        **{k: figures_of(done)[k] for k in NAMES}, **repeats(humanoid, done, fps),
-        "visited": len(seen), "labels": len(kinds)
-    }  # fmt: skip
+        "counted_s": until,
+        "falls": len(falls),
+        "away_s": away,
+        "stayed_down": int(down),
+        **{k: figures_of(done)[k] for k in NAMES},
+        **repeats(humanoid, done, fps),
+        "visited": len(seen),
+        "labels": len(kinds),
+    }
 
 
 def together(places: Places, unit: str, name: str) -> Any:
@@ -256,8 +267,9 @@ def together(places: Places, unit: str, name: str) -> Any:
     count, seconds = (1, 2.0) if places.smoke else (count, seconds)
     tracker, _, generator = loaded()
     acts: Acts = tracker.policy if how.get("acts", True) else Nothing(tracker.policy.num_actions)
-    made = rollouts(tracker, generator, count, seconds, acts=acts,
-                    **{k: v for k, v in how.items() if k != "acts"})  # fmt: skip
+    made = rollouts(
+        tracker, generator, count, seconds, acts=acts, **{k: v for k, v in how.items() if k != "acts"}
+    )
     return [went(made, k, seconds, how.get("recover", True)) for k in range(count)] + [{"bad": made.bad}]
 
 

@@ -318,7 +318,8 @@ class StablePDBackend(CpuBackend):
         rows = torch.arange(model.nv).repeat_interleave(torch.tensor(model.M_rownnz).long())
         self._places = rows, torch.tensor(model.M_colind).long()
 
-    def _inertia(self) -> Tensor:
+    def inertia(self) -> Tensor:
+        """`(N, nv, nv)` float64, the inertia of all degrees of freedom of the worlds as they stand."""
         nv = self.model.nv
         full = torch.zeros(self.num_envs, nv, nv, dtype=torch.float64)
         rows, columns = self._places
@@ -330,7 +331,7 @@ class StablePDBackend(CpuBackend):
         held, dt = self.drive.qfrc_applied.clone(), self.model.opt.timestep
         for _ in range(nstep):
             torque = stable_pd_torque(
-                self._inertia(),
+                self.inertia(),
                 self.state["qfrc_bias"],
                 self._kp,
                 self._kd,
@@ -375,8 +376,10 @@ def bench_physics(
             tell(f"physics, {name}: {sim.rate_hz:g} Hz {sim.integrator}")
         imitation = build(own.library, replace(own.config, sim=sim))
         make = (_stable if name == "stable PD" else _servos)(imitation, scale)
-        rows.append({"physics": name, "rate_hz": sim.rate_hz, "integrator": sim.integrator}
-                    | _score(imitation, policy, make, clip, frame, limit))  # fmt: skip
+        rows.append(
+            {"physics": name, "rate_hz": sim.rate_hz, "integrator": sim.integrator}
+            | _score(imitation, policy, make, clip, frame, limit)
+        )
     return rows
 
 
@@ -449,18 +452,25 @@ def theirs(task: Imitation, seed: int, samples: int) -> dict[str, float]:
         return {**common, "hidden_dims": list(widths)}
 
     config = {
-        "num_steps_per_env": ppo.horizon, "save_interval": 10**9,
+        "num_steps_per_env": ppo.horizon,
+        "save_interval": 10**9,
         "obs_groups": {"actor": [GROUP], "critic": [GROUP]},
         "algorithm": {
-            "class_name": "PPO", "num_learning_epochs": ppo.epochs,
-            "num_mini_batches": max(1, round(batch / ppo.minibatch)), "gamma": ppo.gamma,
-            "lam": ppo.lam, "clip_param": ppo.clip, "entropy_coef": ppo.entropy_weight,
-            "learning_rate": ppo.policy_lr, "schedule": "fixed", "desired_kl": None,
-            "max_grad_norm": ppo.policy_grad_norm or 1e9
+            "class_name": "PPO",
+            "num_learning_epochs": ppo.epochs,
+            "num_mini_batches": max(1, round(batch / ppo.minibatch)),
+            "gamma": ppo.gamma,
+            "lam": ppo.lam,
+            "clip_param": ppo.clip,
+            "entropy_coef": ppo.entropy_weight,
+            "learning_rate": ppo.policy_lr,
+            "schedule": "fixed",
+            "desired_kl": None,
+            "max_grad_norm": ppo.policy_grad_norm or 1e9,
         },
         "actor": {**network(ppo.policy_hidden), "distribution_cfg": noise},
-        "critic": network(ppo.value_hidden)
-    }  # fmt: skip
+        "critic": network(ppo.value_hidden),
+    }
     # Its runner prints the networks and a table per iteration.
     with contextlib.redirect_stdout(io.StringIO()):
         runner = OnPolicyRunner(cast(Any, env), config)
@@ -509,8 +519,14 @@ def learned_rows(places: Places, raws: Raws) -> Iterator[Figure]:
         rows = [raw for unit, raw in raws.items() if unit.startswith(name)]
         for metric in ("training_samples_per_s", "done", "mpjpe_mm"):
             values = [r[metric] for r in rows]
-            yield Figure(f"DeepMimic walk, learner of {name}", metric, median(values), len(rows),
-                         between(values), len(rows))  # fmt: skip
+            yield Figure(
+                f"DeepMimic walk, learner of {name}",
+                metric,
+                median(values),
+                len(rows),
+                between(values),
+                len(rows),
+            )
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -533,10 +549,13 @@ def stepping_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Rates, and shares of the limit."""
     r = raws["stepping"]
     values = {
-        "raw_steps_per_s": r["raw_per_s"], "env_steps_per_s": r["stepping_per_s"],
-        "training_samples_per_s": r["training_per_s"], "env_share_of_raw": r["stepping_of_raw"],
-        "training_share_of_raw": r["training_of_raw"], "memory_mb": r["memory_mb"]
-    }  # fmt: skip
+        "raw_steps_per_s": r["raw_per_s"],
+        "env_steps_per_s": r["stepping_per_s"],
+        "training_samples_per_s": r["training_per_s"],
+        "env_share_of_raw": r["stepping_of_raw"],
+        "training_share_of_raw": r["training_of_raw"],
+        "memory_mb": r["memory_mb"],
+    }
     yield from of(f"{r['envs']} characters, {_threads(r['threads'])}", values, r["repeats"])
 
 
@@ -569,8 +588,12 @@ def scaling(places: Places, unit: str) -> Any:
 def scaling_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Rates beside the limit."""
     for unit, r in raws.items():
-        values = {"env_steps_per_s": r["stepping_per_s"], "raw_steps_per_s": r["raw_per_s"],
-                  "env_share_of_raw": r["stepping_of_raw"], "memory_mb": r["memory_mb"]}  # fmt: skip
+        values = {
+            "env_steps_per_s": r["stepping_per_s"],
+            "raw_steps_per_s": r["raw_per_s"],
+            "env_share_of_raw": r["stepping_of_raw"],
+            "memory_mb": r["memory_mb"],
+        }
         yield from of(unit, values, 3)
 
 

@@ -88,10 +88,12 @@ def imitated(places: Places, unit: str) -> Any:
         except PoiseError as problem:
             return {"refused": problem.what}
     return {
-        "shown_after_s": seen, "shown_whole": float(first.card.tracked == 1.0),
-        "learned_in_s": time.perf_counter() - began - seen, "success_over_all_starts": card.succ,
-        "mpjpe_mm": card.mpjpe_mm
-    }  # fmt: skip
+        "shown_after_s": seen,
+        "shown_whole": float(first.card.tracked == 1.0),
+        "learned_in_s": time.perf_counter() - began - seen,
+        "success_over_all_starts": card.succ,
+        "mpjpe_mm": card.mpjpe_mm,
+    }
 
 
 def imitated_rows(places: Places, raws: Raws) -> Iterator[Figure]:

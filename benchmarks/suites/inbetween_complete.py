@@ -40,10 +40,10 @@ from poise.learn.transition import FilledGap, Known, SkeletonLayout
 from poise.metrics import l2p
 from poise.motion import Clip, Skeleton, trim
 from poise.motion.rotations import forward_kinematics, normalize
-from poise.motion.windows import FrameBank
 from poise.score.gaps import BANDAI, BANDAI_TAKES, GapRow, TestSet, evaluate, predict, score, test_set
 from poise.synthesis.filler import Gap, interpolated
 from poise.synthesis.keyframes import fill_keyframes
+from poise.synthesis.windows import FrameBank
 from training.inbetween import config_of
 
 LENGTHS = (5, 15, 30, 45)
@@ -103,9 +103,13 @@ def protocol_slerp(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
 
 #: What is tried on validation, at one length; the iterations (0 to 7) are chosen at each.
 SETTINGS = (
-    Adaptation(lr=3e-6, beta=0.01), Adaptation(lr=1e-5, beta=0.01), Adaptation(lr=3e-5, beta=0.01),
-    Adaptation(lr=1e-4, beta=0.01), Adaptation(lr=1e-5, beta=0.0), Adaptation(lr=1e-5, beta=0.1)
-)  # fmt: skip
+    Adaptation(lr=3e-6, beta=0.01),
+    Adaptation(lr=1e-5, beta=0.01),
+    Adaptation(lr=3e-5, beta=0.01),
+    Adaptation(lr=1e-4, beta=0.01),
+    Adaptation(lr=1e-5, beta=0.0),
+    Adaptation(lr=1e-5, beta=0.1),
+)
 
 
 #: Windows of the validation part that choices are made on.
@@ -247,10 +251,14 @@ def whole_clip(model: InbetweenModel, clip: Clip, every: int) -> dict[str, Any]:
 
     filled = fill_keyframes(clip, keys, model)
     return {
-        "clip": clip.name, "every": every, "gaps": len(gaps), "filled_mm": off(filled.clips[0]),
-        "interpolated_mm": off(interpolated(clip, *clip.tensors(), gaps)),
-        "faults": len(filled.faults), "over_limit": round(max(filled.over), 2)
-    }  # fmt: skip
+        "clip": clip.name,
+        "every": every,
+        "gaps": len(gaps),
+        "filled_mm": off(filled.clips[0]),
+        "interpolated_mm": off(interpolated(clip, clip.root_pos, clip.rot, gaps)),
+        "faults": len(filled.faults),
+        "over_limit": round(max(filled.over), 2),
+    }
 
 
 # --- sets -----------------------------------------------------------------------------------------
@@ -339,9 +347,10 @@ def strata(places: Places, unit: str) -> Any:
     }[unit]
     own = some(test, picked)
     return {
-        "windows": len(picked), "interpolation": plain(evaluate(line, own, LENGTHS)),
-        "network": plain(evaluate(shipped().net, own, LENGTHS))
-    }  # fmt: skip
+        "windows": len(picked),
+        "interpolation": plain(evaluate(line, own, LENGTHS)),
+        "network": plain(evaluate(shipped().net, own, LENGTHS)),
+    }
 
 
 STRATA = (
@@ -412,9 +421,13 @@ def bandai(places: Places, unit: str) -> Any:
     net, _, seed = method.partition(", seed ")
     protocol = PROTOCOLS[name]
     config = Inbetween(
-        net="rtn" if net == "rtn" else "transformer", name=protocol.name, final=protocol.final,
-        validation=protocol.validation, seed=int(seed or 0), contacts="harvey"
-    )  # fmt: skip
+        net="rtn" if net == "rtn" else "transformer",
+        name=protocol.name,
+        final=protocol.final,
+        validation=protocol.validation,
+        seed=int(seed or 0),
+        contacts="harvey",
+    )
     folder = places.work / "bandai" / unit.replace(", ", "-").replace("; ", "-").replace(" ", "-")
     library, minutes, steps = places.data / "other/bandai_bvh", 180.0, None
     if places.smoke:
@@ -502,11 +515,14 @@ def completed(places: Places, unit: str) -> Any:
     # The null: what the body is from its keyframes if it stays on the first one.
     still = np.linalg.norm(clip.positions()[keys] - clip.positions()[keys[:1]], axis=-1).mean()
     return {
-        "keyframes": len(keys), "keyframes_met_mm": float(np.mean(done.met_mm)),
-        "worst_keyframe_mm": max(done.met_mm), "whole": float(not done.failures),
+        "keyframes": len(keys),
+        "keyframes_met_mm": float(np.mean(done.met_mm)),
+        "worst_keyframe_mm": max(done.met_mm),
+        "whole": float(not done.failures),
         "kept_exactly": float(np.abs(made - clip.positions()[keys]).max() < 1e-6),
-        "core_s": time.process_time() - begun, "standing_still_mm": 1000 * float(still)
-    }  # fmt: skip
+        "core_s": time.process_time() - begun,
+        "standing_still_mm": 1000 * float(still),
+    }
 
 
 def completed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
@@ -520,9 +536,13 @@ def completed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 
 #: Dances, jumps and walks that are filled alone.
 KINEMATIC = (
-    "cmu_amc/0[1-9]/*.amc", "cmu_amc/3[589]/*.amc", "cmu_bvh/ad/*.bvh", "deepmimic_txt/*.txt",
-    "other/mass_bvh/*.bvh", "other/bandai_bvh/*dance*.bvh"
-)  # fmt: skip
+    "cmu_amc/0[1-9]/*.amc",
+    "cmu_amc/3[589]/*.amc",
+    "cmu_bvh/ad/*.bvh",
+    "deepmimic_txt/*.txt",
+    "other/mass_bvh/*.bvh",
+    "other/bandai_bvh/*dance*.bvh",
+)
 
 
 def filled_files(places: Places) -> list[str]:
@@ -550,8 +570,10 @@ def fastest(places: Places, unit: str) -> Any:
 def fastest_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """How many are within what people reach."""
     rows = [r for r in raws.values() if r is not None]
-    values = {"within_limits": sum(r[0] <= 1.0 for r in rows) / len(rows),
-              "within_1.5_of_recorded": sum(r[1] <= 1.5 for r in rows) / len(rows)}  # fmt: skip
+    values = {
+        "within_limits": sum(r[0] <= 1.0 for r in rows) / len(rows),
+        "within_1.5_of_recorded": sum(r[1] <= 1.5 for r in rows) / len(rows),
+    }
     yield from of("sixty clips, a keyframe a second, filled alone", values, len(rows))
 
 

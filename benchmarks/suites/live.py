@@ -34,7 +34,7 @@ from benchmarks.common.runner import Part, Raws
 from poise.formats.point_fit import fit_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.kinematics.retarget.keypoint_goal import PointBody
+from poise.kinematics.retargeting.keypoint_goal import PointBody
 from poise.live.characters import FALLS, RETURNS
 from poise.live.protocol import LiveConfig
 from poise.live.session import Live
@@ -52,9 +52,11 @@ def serve(*argv: str) -> tuple[subprocess.Popen[str], str]:
     """`poise live` in a process of its own, and its address."""
     process = subprocess.Popen(
         [sys.executable, "-m", "poise", "live", "--port", "0", *argv],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+    )
     assert process.stdout is not None
     for line in process.stdout:
         if found := re.search(r"http://(\S+?)/", line):
@@ -190,33 +192,40 @@ def told(seen: Sequence[tuple[float, dict[str, Any]]], sent: Told, warms_s: floa
                 off[k].append(c["off_mm"])
     doing = Counter(c["doing"] for _, s in counted for c in s["characters"])
     return {
-        "sent": dict(sent.counts), "refused": last["refused"],
+        "sent": dict(sent.counts),
+        "refused": last["refused"],
         "hz": {
-            "median": float(np.median(hz)), "p1": float(np.percentile(hz, 1)), "least": float(hz.min())
+            "median": float(np.median(hz)),
+            "p1": float(np.percentile(hz, 1)),
+            "least": float(hz.min()),
         },
         "latency_ms_beyond_buffer": {
-            "p50": float(np.median(late[:, 0])), "p99": float(np.median(late[:, 1])),
-            "worst minute's p99": float(late[:, 1].max())
+            "p50": float(np.median(late[:, 0])),
+            "p99": float(np.median(late[:, 1])),
+            "worst minute's p99": float(late[:, 1].max()),
         },
         "step_ms": {"p50": float(np.median(steps[:, 0])), "p99": float(np.median(steps[:, 1]))},
-        "steps_late": last["behind"], "resets": last["resets"], "looked_ahead": last["looked_ahead"],
+        "steps_late": last["behind"],
+        "resets": last["resets"],
+        "looked_ahead": last["looked_ahead"],
         "characters": [
-            {**{n: c[n] for n in ("doing", "lost", "falls", "recovered")},
-             "longest_s_down": round(longest[k], 1), "off_mm_median": float(np.median(off[k] or [0]))}
+            {
+                **{n: c[n] for n in ("doing", "lost", "falls", "recovered")},
+                "longest_s_down": round(longest[k], 1),
+                "off_mm_median": float(np.median(off[k] or [0])),
+            }
             for k, c in enumerate(last["characters"])
         ],
         "share_of_time": {k: round(v / sum(doing.values()), 4) for k, v in doing.items()},
-        "unrecovered": sum(c["doing"] in (FALLS, RETURNS) for c in last["characters"])
-    }  # fmt: skip
+        "unrecovered": sum(c["doing"] in (FALLS, RETURNS) for c in last["characters"]),
+    }
 
 
 def endure(clips: Sequence[Clip], minutes: float, seed: int, smoke: bool) -> dict[str, Any]:
     """One run."""
     seconds, four = 60 * minutes, [clips[k % len(clips)] for k in range(4)]
     process, host = serve("--stream", "--characters", "4", "--lookahead", "1", "--buffer", "0.3")
-    row: dict[str, Any] = {
-        "minutes": 0.0, "clips": [c.name for c in four], "memory_mb": []
-    }  # fmt: skip
+    row: dict[str, Any] = {"minutes": 0.0, "clips": [c.name for c in four], "memory_mb": []}
     seen, sent, began = list[tuple[float, dict[str, Any]]](), Told(), time.perf_counter()
 
     def heard(figures: dict[str, Any]) -> None:
@@ -295,15 +304,16 @@ def sent(clip: Clip, tracker: Tracker, seed: int) -> Sent:
         points = Keypoints(clip.skeleton.names, clip.positions(), clip.fps, clip.name)
         body = PointBody.calibrate(points, tracker.example, tracker.humanoid.table)
         whole = fit_clip(points)
-        places, root, rot = (x.numpy() for x in body.follow(points.positions))
+        places, root, rot = body.follow(points.positions)
         packets = [
             Packet("x", k / rate, whole.skeleton, root[k], rot[k], whole, places[k])
             for k in range(clip.frames)
         ]
     coming = sorted(
         (k / rate + abs(rng.normal(0.0, LATE_S)), k)
-        for k in range(clip.frames) if k < 2 or rng.uniform() > LOST
-    )  # fmt: skip
+        for k in range(clip.frames)
+        if k < 2 or rng.uniform() > LOST
+    )
     return Sent(clip, packets, coming)
 
 
@@ -387,14 +397,18 @@ def endured_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     values = {
         "latency_p50_ms": mean_of(r["latency_ms_beyond_buffer"]["p50"] for r in rows),
         "latency_p99_ms": mean_of(r["latency_ms_beyond_buffer"]["p99"] for r in rows),
-        "hz": mean_of(r["hz"]["median"] for r in rows), "hz_least": min(r["hz"]["least"] for r in rows),
-        "steps_late": sum(r["steps_late"] for r in rows), "minutes": sum(r["minutes"] for r in rows),
-        "losses": sum(c["lost"] for c in everyone), "came_back": sum(c["recovered"] for c in everyone),
+        "hz": mean_of(r["hz"]["median"] for r in rows),
+        "hz_least": min(r["hz"]["least"] for r in rows),
+        "steps_late": sum(r["steps_late"] for r in rows),
+        "minutes": sum(r["minutes"] for r in rows),
+        "losses": sum(c["lost"] for c in everyone),
+        "came_back": sum(c["recovered"] for c in everyone),
         "longest_down_s": max(c["longest_s_down"] for c in everyone),
         "tracks": mean_of(r["share_of_time"].get("tracks", 0.0) for r in rows),
         "memory_mb": max(m for r in rows for _, m in r["memory_mb"]),
-        "crashes": sum(not r["alive"] for r in rows), "unrecovered": sum(r["unrecovered"] for r in rows)
-    }  # fmt: skip
+        "crashes": sum(not r["alive"] for r in rows),
+        "unrecovered": sum(r["unrecovered"] for r in rows),
+    }
     yield from of("four people, otherwise free cores", values, 4 * len(rows), seeds=len(rows))
 
 
@@ -452,11 +466,14 @@ def dreamt(places: Places, unit: str) -> Any:
         for name in ("lost", "falls", "recovered")
     }
     return {
-        "minutes": seconds / 60, "hz": float(np.median([f["hz"] for f in seen])),
-        "steps_late": last["behind"] - first["behind"], "looked_ahead": last["looked_ahead"], **counted,
+        "minutes": seconds / 60,
+        "hz": float(np.median([f["hz"] for f in seen])),
+        "steps_late": last["behind"] - first["behind"],
+        "looked_ahead": last["looked_ahead"],
+        **counted,
         "falls_per_hour": 3600 * counted["falls"] / (n * seconds),
-        "share_away": sum(d in (FALLS, RETURNS) for d in doing) / len(doing)
-    }  # fmt: skip
+        "share_away": sum(d in (FALLS, RETURNS) for d in doing) / len(doing),
+    }
 
 
 def dream_rows(places: Places, raws: Raws) -> Iterator[Figure]:

@@ -150,9 +150,14 @@ def disturbed(clip: Clip, condition: Condition, seed: int) -> Clip:
 
 
 def followed(
-    places: Places, clip: str, of_set: str, controller: str, trials: tuple[int, ...], seed: int = 0,
-    condition: Condition | None = None
-) -> Any:  # fmt: skip
+    places: Places,
+    clip: str,
+    of_set: str,
+    controller: str,
+    trials: tuple[int, ...],
+    seed: int = 0,
+    condition: Condition | None = None,
+) -> Any:
     """One clip with one controller: what each start comes to. The draws of lookahead at start k are of
     the seed and k."""
     tracker, wrong = open_run(None).tracker, condition or Condition()
@@ -171,9 +176,14 @@ def followed(
 
 
 def _episode(
-    tracker: Tracker, task: Imitation, controller: str, config: LookaheadConfig, wrong: Condition,
-    trial: int, seed: int
-) -> dict[str, Any]:  # fmt: skip
+    tracker: Tracker,
+    task: Imitation,
+    controller: str,
+    config: LookaheadConfig,
+    wrong: Condition,
+    trial: int,
+    seed: int,
+) -> dict[str, Any]:
     backend = None
     if wrong.push_n:
         backend = Pushed(task.model, task.humanoid.rows_of("spine")[-1] + 1, wrong.push_n, seed)
@@ -207,11 +217,14 @@ def plausible(rollouts: RolloutSet) -> dict[str, float | None]:
     card = score_rollouts(rollouts)
     source = card.reference
     found = {
-        "g_mpjpe_mm": card.mpjpe_global_mm, "mpjpe_mm": card.mpjpe_mm,
-        "acc_mm_per_frame2": card.acc_mm_per_frame2, "jerk_ratio": _ratio(card.jerk, source["jerk"]),
+        "g_mpjpe_mm": card.mpjpe_global_mm,
+        "mpjpe_mm": card.mpjpe_mm,
+        "acc_mm_per_frame2": card.acc_mm_per_frame2,
+        "jerk_ratio": _ratio(card.jerk, source["jerk"]),
         "slide_mm_per_s": card.foot_slide_mm_per_s,
-        "source_slide_mm_per_s": source["foot_slide_mm_per_s"], "stance_ratio": stance(rollouts)
-    }  # fmt: skip
+        "source_slide_mm_per_s": source["foot_slide_mm_per_s"],
+        "stance_ratio": stance(rollouts),
+    }
     return {k: v if math.isfinite(v) else None for k, v in found.items()}
 
 
@@ -232,9 +245,14 @@ def stance(rollouts: RolloutSet) -> float:
 # --- figures --------------------------------------------------------------------------------------
 
 MEDIANS = (
-    "g_mpjpe_mm", "mpjpe_mm", "acc_mm_per_frame2", "jerk_ratio", "slide_mm_per_s",
-    "source_slide_mm_per_s", "stance_ratio"
-)  # fmt: skip
+    "g_mpjpe_mm",
+    "mpjpe_mm",
+    "acc_mm_per_frame2",
+    "jerk_ratio",
+    "slide_mm_per_s",
+    "source_slide_mm_per_s",
+    "stance_ratio",
+)
 
 
 def figures(places: Places, raws: Raws, subject: str) -> Iterator[Figure]:
@@ -298,8 +316,11 @@ def searched(places: Places, clip: str, of_set: str) -> Any:
     spent = time.process_time() - begun
     rollouts, _ = run_episodes(
         lambda n: task.bare().env(n, None, False, 1, help_scale=0.0, guard=False),
-        replay(found, tracker.policy), one, one, cycles=1
-    )  # fmt: skip
+        replay(found, tracker.policy),
+        one,
+        one,
+        cycles=1,
+    )
     seconds = len(found.actions) / task.config.sim.control_hz
     return {"alone": False, "core_s_a_s": spent / seconds, **episodes(rollouts)[0]}
 
@@ -310,9 +331,11 @@ def search_rows(places: Places, raws: Raws, subject: str) -> Iterator[Figure]:
     lost = [r for r in tried if not r["alone"]]
     found = sum(r["won"]["phc"] for r in lost)
     values = {
-        "lost_alone": len(lost), "found": found, "done": (len(tried) - len(lost) + found) / len(tried),
-        "core_s_a_s": median_of(r["core_s_a_s"] for r in lost)
-    }  # fmt: skip
+        "lost_alone": len(lost),
+        "found": found,
+        "done": (len(tried) - len(lost) + found) / len(tried),
+        "core_s_a_s": median_of(r["core_s_a_s"] for r in lost),
+    }
     yield from of(subject, values, len(tried))
 
 
@@ -330,10 +353,14 @@ def part(
     said = {"policy": "policy alone", "nothing": "nothing (action 0)"}.get(controller, controller)
     needs = ("data",) if SETS[name].pattern else ("library",)
     return Part(
-        f"{title}, {SETS[name].learned}; {said}", partial(_units, name=name, every=every),
+        f"{title}, {SETS[name].learned}; {said}",
+        partial(_units, name=name, every=every),
         partial(followed, of_set=name, controller=controller, trials=trials),
-        partial(figures, subject=f"{title}; {said}"), ("tracker",), hours=hours, needs=needs
-    )  # fmt: skip
+        partial(figures, subject=f"{title}; {said}"),
+        ("tracker",),
+        hours=hours,
+        needs=needs,
+    )
 
 
 def wrong_part(name: str) -> Part:
@@ -394,8 +421,11 @@ PARTS = {
     "library, draws": draws_part("library", _EIGHTH, 8, (1, 2), 1.2),
     **{name: wrong_part(name) for name in CONDITIONS},
     "search, bandai": Part(
-        "what 512 characters find of what the policy loses", partial(_units, name="bandai"),
-        partial(searched, of_set="bandai"), partial(search_rows, subject=f"{_BANDAI}; search"),
-        ("tracker",), hours=0.5
-    )
-}  # fmt: skip
+        "what 512 characters find of what the policy loses",
+        partial(_units, name="bandai"),
+        partial(searched, of_set="bandai"),
+        partial(search_rows, subject=f"{_BANDAI}; search"),
+        ("tracker",),
+        hours=0.5,
+    ),
+}

@@ -76,10 +76,12 @@ def figures(made: Imitation, act: Acts, newtons: float, seconds: float) -> dict[
     )
     minutes = WORLDS * seconds / 60.0
     return {
-        "falls_a_minute": round(falls / minutes, 2), "root_m": round(float(torch.stack(far).mean()), 3),
+        "falls_a_minute": round(falls / minutes, 2),
+        "root_m": round(float(torch.stack(far).mean()), 3),
         "nearest_pose_mm": round(float(torch.stack(near).mean()), 1),
-        "jerk": round(float(ours), 1), "jerk_of_the_reference": round(float(asked), 1)
-    }  # fmt: skip
+        "jerk": round(float(ours), 1),
+        "jerk_of_the_reference": round(float(asked), 1),
+    }
 
 
 def trained(made: Imitation, folder: Path, samples: int) -> Acts:

@@ -109,14 +109,29 @@ def uhc(name: str, seed: int) -> ResidualForce:
 
 #: Which row each is compared with.
 AGAINST = {
-    "relaxed": "plain", "multiplicative": "relaxed", "progressive": "multiplicative",
-    "recovery": "progressive", "absolute-keypoints": "absolute-rotations",
-    "no-energy": "relaxed", "style": "relaxed", "one-large-network": "relaxed",
-    "means": "progressive", "primitives-1": "progressive", "primitives-3": "progressive",
-    "primitives-4": "progressive", "uhc": "relaxed", "uhc-helped": "uhc",
-    "heading": "bare", "window": "bare", "filter": "bare", "root": "bare", "prices": "bare",
-    "own-bodies": "bare", "as-shipped": "bare", "together": "bare"
-}  # fmt: skip
+    "relaxed": "plain",
+    "multiplicative": "relaxed",
+    "progressive": "multiplicative",
+    "recovery": "progressive",
+    "absolute-keypoints": "absolute-rotations",
+    "no-energy": "relaxed",
+    "style": "relaxed",
+    "one-large-network": "relaxed",
+    "means": "progressive",
+    "primitives-1": "progressive",
+    "primitives-3": "progressive",
+    "primitives-4": "progressive",
+    "uhc": "relaxed",
+    "uhc-helped": "uhc",
+    "heading": "bare",
+    "window": "bare",
+    "filter": "bare",
+    "root": "bare",
+    "prices": "bare",
+    "own-bodies": "bare",
+    "as-shipped": "bare",
+    "together": "bare",
+}
 
 
 NOTHING = "nothing (action 0)"

@@ -81,22 +81,24 @@ class Library(NamedTuple):
 
 LIBRARIES = {
     "CMU": Library(
-        ("cmu_amc", "cmu_bvh"), ("cmu 05", "cmu 08", "cmu 11", "cmu 14", "cmu 39"),
+        ("cmu_amc", "cmu_bvh"),
+        ("cmu 05", "cmu 08", "cmu 11", "cmu 14", "cmu 39"),
         (
             ("dance", r"05_|salsa|indian|dance"),
             ("martial arts", r"02_0[5-9]|135_|14_|martial|punch|kick|heian|11_"),
-            ("walk and run", r"(06|07|08|35|38|39|43)_|02_0[1-3]|walk|run|jog")
-        )
+            ("walk and run", r"(06|07|08|35|38|39|43)_|02_0[1-3]|walk|run|jog"),
+        ),
     ),
     "Bandai": Library(
-        ("other/bandai_bvh",), (),
+        ("other/bandai_bvh",),
+        (),
         (
             ("turning walk", r"_walk_(turn|left|right|back)"),
             ("walk", r"_walk_"),
-            ("run", r"_(run|dash)_")
-        )
-    )
-}  # fmt: skip
+            ("run", r"_(run|dash)_"),
+        ),
+    ),
+}
 
 
 class Clips(NamedTuple):
@@ -157,9 +159,10 @@ def windows_of(clips: Clips, library: Library) -> tuple[list[Window], list[int]]
     # Neither short clips of held-out subjects are learned, nor partners of dancers that are held out.
     partners = {p for k in held for p in partners_of(clips.names[k])}
     return out, [
-        k for k, n in enumerate(clips.names)
+        k
+        for k, n in enumerate(clips.names)
         if k not in held and n not in partners and subject_of(n) not in library.cross
-    ]  # fmt: skip
+    ]
 
 
 def partners_of(name: str) -> set[str]:
@@ -176,10 +179,14 @@ def motions_of(clips: Clips, rows: Sequence[int], tracker: Tracker) -> Motions:
     pasts = [q[i : i + PAST] for q in qpos for i in range(0, len(q) - PAST, PAST)]
     angles = torch.cat(qpos)[:, 7:]
     return Motions(
-        PackedFrames(frames, first), torch.stack(pasts), torch.stack((angles.amin(0), angles.amax(0))),
-        reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate,
-        tuple(clips.names[k] for k in rows)
-    )  # fmt: skip
+        PackedFrames(frames, first),
+        torch.stack(pasts),
+        torch.stack((angles.amin(0), angles.amax(0))),
+        reach_of(frames, tracker.humanoid.table, rate),
+        tuple(tracker.humanoid.hinges),
+        rate,
+        tuple(clips.names[k] for k in rows),
+    )
 
 
 # --- methods ---------------------------------------------------------------------------------------
@@ -307,10 +314,18 @@ def control(name: str, seed: int, tracker: Tracker, motions: list[Tensor], sampl
     ppo = replace(ResidualForce().ppo, minibatch=512)
     ppo = replace(ppo, std=ON_TOP_STD) if name in ON_TOP else ppo
     config = ResidualForce(
-        help_limit=LIMIT, help_start=None, reward="local", done="height", expert=False, seed=seed,
-        completion_bonus=False, num_envs=128, sim=tracker.config.sim, ppo=ppo,
-        **(CONTROL | ON_TOP)[name]
-    )  # fmt: skip
+        help_limit=LIMIT,
+        help_start=None,
+        reward="local",
+        done="height",
+        expert=False,
+        seed=seed,
+        completion_bonus=False,
+        num_envs=128,
+        sim=tracker.config.sim,
+        ppo=ppo,
+        **(CONTROL | ON_TOP)[name],
+    )
     own = task(config, tracker.humanoid)
     if name in ON_TOP:
         under = universal_task(
@@ -471,8 +486,20 @@ FALLEN = 0.3
 OURS = "RFC-Implicit"
 
 
-ALL = ("zero velocity", "ours", OURS, "RFC-Explicit", "EgoPose", "ERD", "acLSTM",
-       "no residual force", "no additive action", "servos", "universal policy", *ON_TOP)  # fmt: skip
+ALL = (
+    "zero velocity",
+    "ours",
+    OURS,
+    "RFC-Explicit",
+    "EgoPose",
+    "ERD",
+    "acLSTM",
+    "no residual force",
+    "no additive action",
+    "servos",
+    "universal policy",
+    *ON_TOP,
+)
 
 
 OF_A_CLASS = ("ours", "ERD", "acLSTM")
@@ -507,11 +534,13 @@ def figures(windows: list[Window], far: np.ndarray) -> dict[str, dict[str, Any]]
     for name, rows in groups_of(windows).items():
         mean, last = far[rows].mean(-1), far[rows][..., -1]
         out[name] = {
-            "windows": len(rows), "clips": len({windows[k].clip for k in rows}),
-            "mae": round(float(mean.mean()), 3), "fae": round(float(last.mean()), 3),
+            "windows": len(rows),
+            "clips": len({windows[k].clip for k in rows}),
+            "mae": round(float(mean.mean()), 3),
+            "fae": round(float(last.mean()), 3),
             "best_mae": round(float(mean.min(-1).mean()), 3),
-            "best_fae": round(float(last.min(-1).mean()), 3)
-        }  # fmt: skip
+            "best_fae": round(float(last.min(-1).mean()), 3),
+        }
     return out
 
 
@@ -566,9 +595,13 @@ class Rows:
             done = simulated(self.tracker, by, pasts, self.futures(source))
             qpos = done.qpos
             about |= {
-                "body": True, "help_limit": by.limit, "help_n": done.force, "help_nm": done.torque,
-                "control_steps": by.samples, "seconds": by.seconds
-            }  # fmt: skip
+                "body": True,
+                "help_limit": by.limit,
+                "help_n": done.force,
+                "help_nm": done.torque,
+                "control_steps": by.samples,
+                "seconds": by.seconds,
+            }
         count = len(qpos) // len(self.windows)
         about |= {"samples": count, "fallen": fallen(self.windows, qpos, count)}
         far = off(self.windows, qpos, count)

@@ -35,10 +35,13 @@ from poise.score.episodes import frames_from
 SAMPLES, SEEDS = 700_000, (0, 1)
 #: Pairs whose order the paper states: the first above the second.
 CLAIMS = (
-    ("rfc-implicit", "deepmimic"), ("rfc-explicit", "deepmimic"), ("rfc-implicit", "rfc-explicit"),
-    ("rfc-explicit-all", "rfc-explicit"), ("rfc-implicit-uncapped", "rfc-implicit"),
-    ("rfc-explicit-uncapped", "rfc-explicit")
-)  # fmt: skip
+    ("rfc-implicit", "deepmimic"),
+    ("rfc-explicit", "deepmimic"),
+    ("rfc-implicit", "rfc-explicit"),
+    ("rfc-explicit-all", "rfc-explicit"),
+    ("rfc-implicit-uncapped", "rfc-implicit"),
+    ("rfc-explicit-uncapped", "rfc-explicit"),
+)
 
 
 #: File and frames per second of each clip. All of CMU's are said to have 120, but in 90_08 and 90_11
@@ -112,10 +115,13 @@ def final(imitation: Imitation, policy: Path | None, samples: int) -> dict[str, 
     far = frames_from(imitation.reference, clip, start) > imitation.reference.rate_hz
     card = evaluate(imitation, acts, {"samples": samples}, starts=(clip[far], start[far])).card
     return {
-        "starts": int(far.sum()), "eval_imitation": card.reward["total"], "succ": card.succ,
-        "mpjpe_mm": card.mpjpe_mm, "force_mean_n": card.help.force_mean_n,
-        "torque_mean_nm": card.help.torque_mean_nm
-    }  # fmt: skip
+        "starts": int(far.sum()),
+        "eval_imitation": card.reward["total"],
+        "succ": card.succ,
+        "mpjpe_mm": card.mpjpe_mm,
+        "force_mean_n": card.help.force_mean_n,
+        "torque_mean_nm": card.help.torque_mean_nm,
+    }
 
 
 def units(places: Places) -> list[str]:

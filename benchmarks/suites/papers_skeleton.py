@@ -38,12 +38,12 @@ from poise.learn import Until
 from poise.metrics import l2p
 from poise.motion import Clip, ClipLibrary, shifted, trim
 from poise.motion.rotations import forward_kinematics
-from poise.motion.windows import pack_frames
 from poise.papers.compliant.scene_training import digest_of
 from poise.papers.skeleton2humanoid.recipe import Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force_settings import ResidualForce
 from poise.score.gaps import BANDAI, deviation
+from poise.synthesis.windows import pack_frames
 
 PAST, AFTER, FPS = 10, 5, 30.0
 
@@ -115,8 +115,8 @@ def figures(made: Motion, truth: Motion, task: Imitation, std: Tensor, length: i
         "fq_percent": round(100 * float((feet < -THROUGH).double().mean()), 2),
         "jq_percent": round(100 * float((low < -THROUGH).double().mean()), 2),
         "sm_mm": round(float(1000 * moved.mean()), 2),
-        "l2p": round(float(l2p(made.pos[:, rows].double(), truth.pos[:, rows].double(), std)), 4)
-    }  # fmt: skip
+        "l2p": round(float(l2p(made.pos[:, rows].double(), truth.pos[:, rows].double(), std)), 4),
+    }
 
 
 def by_joints(clips: list[Clip], task: Imitation) -> Motion:
@@ -143,13 +143,15 @@ def policy_row(
     r, card = result.rollouts, result.card
     return {
         **figures(Motion(r.pos, r.quat), truth, task, std, length),
-        "succ": round(card.succ, 4), "mpjpe_mm": round(card.mpjpe_mm, 2),
+        "succ": round(card.succ, 4),
+        "mpjpe_mm": round(card.mpjpe_mm, 2),
         "mpjpe_global_mm": round(card.mpjpe_global_mm, 2),
         "limit_n": round(float(meta["help_limit"]), 1),
         "force_mean_n": round(card.help.force_mean_n, 2),
         "torque_mean_nm": round(card.help.torque_mean_nm, 2),
-        "samples": int(meta["samples"]), "minutes": round((time.perf_counter() - begun) / 60, 1)
-    }  # fmt: skip
+        "samples": int(meta["samples"]),
+        "minutes": round((time.perf_counter() - begun) / 60, 1),
+    }
 
 
 def tracked_row(
@@ -167,9 +169,12 @@ def tracked_row(
         "succ": sum(not d.failures for d in done) / len(done),
         "mpjpe_mm": round(sum(d.card.mpjpe_mm for d in done) / len(done), 2),
         "mpjpe_global_mm": round(sum(d.card.mpjpe_global_mm for d in done) / len(done), 2),
-        "force_mean_n": 0.0, "torque_mean_nm": 0.0, "samples": 0, "minutes": round(took / 60, 1),
-        "policy": digest_of(run.tracker.policy)
-    }  # fmt: skip
+        "force_mean_n": 0.0,
+        "torque_mean_nm": 0.0,
+        "samples": 0,
+        "minutes": round(took / 60, 1),
+        "policy": digest_of(run.tracker.policy),
+    }
 
 
 COUNT, ITERATIONS = 32, 60

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from benchmarks.common.clips import WALK, Places
 from benchmarks.common.rows import Figure, of
@@ -114,9 +113,10 @@ def look(data: Path, row: dict[str, str]) -> dict[str, Any]:
     out["seconds"] = time.process_time() - start
     facts = describe(clip)
     return out | {
-        "format": facts["format"], "wrong": list(_wrong(row, group, facts)),
-        "faults": {kind: len(f) for kind, f in by_kind(examine(clip).faults).items()}
-    }  # fmt: skip
+        "format": facts["format"],
+        "wrong": list(_wrong(row, group, facts)),
+        "faults": {kind: len(f) for kind, f in by_kind(examine(clip).faults).items()},
+    }
 
 
 def _wrong(row: dict[str, str], group: Group, facts: dict[str, Any]) -> list[str]:
@@ -319,8 +319,8 @@ def true_speeds(clip: Clip) -> tuple[float, float]:
     """m/s at which soles go over the floor: of the lowest end (of a walk, which always stands on a foot,
     the mean, of a run the median), and the median of soles with both ends low."""
     table = generate_table(clip.skeleton, None, [clip])
-    pos, quat = (torch.tensor(x[:, [r.joint for r in table.rows]]) for x in clip.world())
-    soles = torch.stack([s.ends for s in soles_of(table, pos, quat).values()], 1).numpy()
+    pos, quat = (x[:, [r.joint for r in table.rows]] for x in clip.world())
+    soles = np.stack([s.ends for s in soles_of(table, pos, quat).values()], 1)
     z, step = 0.5 * (soles[1:, ..., 2] + soles[:-1, ..., 2]), np.diff(soles, axis=0)[..., :2] * clip.fps
     ends, at = z.reshape(len(z), -1), np.arange(len(z))
     low = ends.argmin(1)
@@ -404,7 +404,7 @@ def loop_figures(clip: Clip, overlap: int, travel: Travel) -> dict[str, float]:
     """Slide (mm/s) and jerk (m/s^3) of a loop that is repeated with a travel, and the jerk of its seams
     over the largest elsewhere."""
     long, period = travelled(repeated(clip, overlap, 4), travel), clip.frames - overlap
-    shake = jerk(torch.tensor(long.positions()), clip.fps).numpy()
+    shake = jerk(long.positions(), clip.fps)
     seam = np.zeros(len(shake), dtype=bool)
     # A third difference of frames i to i + 3 reaches across the seam at k P.
     for k in range(1, 4):
@@ -484,9 +484,11 @@ def read_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     size, spent = (sum(r[k] for r in read) for k in ("megabytes", "seconds"))
     values = {
         "read": sum(not r["refused"] for r in human) / len(human),
-        "recognised_otherwise": sum(bool(r["wrong"]) for r in read), "s_per_mb": spent / size,
-        "megabytes": size, "without_a_fault": sum(not r["faults"] for r in read) / len(read)
-    }  # fmt: skip
+        "recognised_otherwise": sum(bool(r["wrong"]) for r in read),
+        "s_per_mb": spent / size,
+        "megabytes": size,
+        "without_a_fault": sum(not r["faults"] for r in read) / len(read),
+    }
     yield from of("real motion files, nothing stated", values, len(human))
     for name in dict.fromkeys(r["format"] for r in read):
         own = [r for r in read if r["format"] == name]
@@ -572,7 +574,7 @@ def looped(places: Places, unit: str) -> Any:
             [
                 "walk, source",
                 "jerk_m_per_s3",
-                float(jerk(torch.tensor(clip.positions()), clip.fps).mean()),
+                float(jerk(clip.positions(), clip.fps).mean()),
             ]
         ]
     return track_rows(places.data, unit)

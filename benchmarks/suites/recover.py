@@ -55,10 +55,14 @@ def rows(places: Places, raws: Raws, method: str) -> Iterator[Figure]:
 def part(policy: str, method: str, acts: bool, hours: float) -> Part:
     """The part of one policy."""
     return Part(
-        f"trials of each fail-state, {method}", lambda p: list(KINDS)[:1] if p.smoke else list(KINDS),
-        partial(recovered, policy=policy, acts=acts), partial(rows, method=method), (policy,),
-        hours=hours, needs=()
-    )  # fmt: skip
+        f"trials of each fail-state, {method}",
+        lambda p: list(KINDS)[:1] if p.smoke else list(KINDS),
+        partial(recovered, policy=policy, acts=acts),
+        partial(rows, method=method),
+        (policy,),
+        hours=hours,
+        needs=(),
+    )
 
 
 PARTS = {

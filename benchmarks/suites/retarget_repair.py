@@ -229,7 +229,7 @@ def measure(clip: Clip, seconds: float = 10.0, config: BodyConfig | None = None)
 
 def _sink_mm(humanoid: Humanoid, qpos: np.ndarray) -> float:
     """The deepest point of any shape under the floor over all frames, mm."""
-    state = Kinematics(humanoid.table)(torch.tensor(qpos))
+    state = Kinematics(humanoid.table)(qpos)
     low = float(lowest_height(humanoid.table, state.pos, state.quat).min())
     return round(max(-low, 0.0) * 1000, 2)
 
@@ -267,8 +267,8 @@ def pair_rows(places: Places, raws: Raws) -> Iterator[Figure]:
         "source_slide_mm_per_s": mean_of(r["slide_mm_s"][0] for r in rows),
         "ends_percent": mean_of(r["end_percent"] for r in rows),
         "there_and_back_mm": mean_of(r["there_and_back"]["mean_mm"] for r in rows),
-        "ms_a_frame": mean_of(1000 * r["seconds"] / r["frames"] for r in rows)
-    }  # fmt: skip
+        "ms_a_frame": mean_of(1000 * r["seconds"] / r["frames"] for r in rows),
+    }
     yield from of("pairs of nine skeletons", values, len(rows))
     null = {
         "farthest_mm": max(r["max_mm"] for r in same),
@@ -316,10 +316,14 @@ REPAIR: dict[str, tuple[tuple[str, ...], str, float, tuple[str, ...]]] = {
     "repair keypoints": (("--as", "keypoints"), "repair.csv", 1.0, ()),
     "repair live": (("--live",), "repair_live.csv", 0.5, ()),
     "repair clean": (("--clean",), "repair_clean.csv", 0.5, ()),
-    "repair track": (("--track", "--clips", "6", "--only", "white", "all", "--sizes", "25", "100"),
-                     "repair_track.csv", 0.5, ("tracker",)),
-    "repair files": (("--files",), "repair_files.csv", 0.3, ())
-}  # fmt: skip
+    "repair track": (
+        ("--track", "--clips", "6", "--only", "white", "all", "--sizes", "25", "100"),
+        "repair_track.csv",
+        0.5,
+        ("tracker",),
+    ),
+    "repair files": (("--files",), "repair_files.csv", 0.3, ()),
+}
 
 
 def repaired(places: Places, unit: str) -> Any:

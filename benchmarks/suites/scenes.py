@@ -85,8 +85,9 @@ def cost(tracker: Tracker, many: int, steps: int, repeats: int) -> dict[str, Any
     out["ms_a_step"] = {k: round(1000 * v, 2) for k, v in middle.items()}
     shares = {
         k: [a / b for a, b in zip(spent["without"], v, strict=True)]
-        for k, v in spent.items() if k != "without"
-    }  # fmt: skip
+        for k, v in spent.items()
+        if k != "without"
+    }
     out["share_of_without"] = {k: round(statistics.median(v), 3) for k, v in shares.items()}
     out["share_quartiles"] = {
         k: [round(float(np.quantile(v, q)), 3) for q in (0.25, 0.75)] for k, v in shares.items()
@@ -207,8 +208,13 @@ def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
         for name in ("impulse", "peak", "torque"):
             if f"{name}_slope" in raw:
                 middle, low, high = raw[f"{name}_slope"]
-                yield Figure(f"throws, {unit}, all levels", f"{name}_slope", middle, raw["throws"],
-                             f"{short(low)} to {short(high)}")  # fmt: skip
+                yield Figure(
+                    f"throws, {unit}, all levels",
+                    f"{name}_slope",
+                    middle,
+                    raw["throws"],
+                    f"{short(low)} to {short(high)}",
+                )
 
 
 # --- scenes ---------------------------------------------------------------------------------------
@@ -346,8 +352,13 @@ def cost_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Shares of the environment without."""
     raw = raws["cost"]
     for name, share in raw["share_of_without"].items():
-        yield Figure(f"control steps with compliance, {name}", "share_of_without", share, raw["steps"],
-                     " to ".join(short(q) for q in raw["share_quartiles"][name]))  # fmt: skip
+        yield Figure(
+            f"control steps with compliance, {name}",
+            "share_of_without",
+            share,
+            raw["steps"],
+            " to ".join(short(q) for q in raw["share_quartiles"][name]),
+        )
 
 
 def costs(places: Places, unit: str) -> Any:

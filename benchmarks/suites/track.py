@@ -27,8 +27,8 @@ from poise.jobs.track.placement import place, points_of
 from poise.jobs.track.robustness import robustness
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip, shifted
+from poise.motion.mirror import mirrored_clip
 from poise.motion.noise import robustness_levels
-from poise.motion.windows import mirrored_clip
 
 #: Clips that are simulated side by side.
 AT_ONCE = 16
@@ -85,10 +85,14 @@ def set_part(name: str, method: str, trials: tuple[int, ...], hours: float) -> P
     """The part of one set and method."""
     needs = ("data",) if SETS[name].pattern else ("library",)
     return Part(
-        f"{SETS[name].title}, {SETS[name].learned}", partial(units, name=name),
+        f"{SETS[name].title}, {SETS[name].learned}",
+        partial(units, name=name),
         partial(episodes_of, of_set=name, method=method, trials=trials),
-        partial(set_rows, name=name, method=method), (METHODS[method][0],), hours=hours, needs=needs
-    )  # fmt: skip
+        partial(set_rows, name=name, method=method),
+        (METHODS[method][0],),
+        hours=hours,
+        needs=needs,
+    )
 
 
 # --- files of pose estimators ---------------------------------------------------------------------
@@ -185,14 +189,16 @@ def hour(places: Places, unit: str) -> Any:
     lost, back = (losses.lost, losses.back) if losses else ((), ())
     away = np.subtract(back, lost[: len(back)])
     return {
-        "clips": len(clips), "clips_done": sum(p.done for p in parts),
+        "clips": len(clips),
+        "clips_done": sum(p.done for p in parts),
         "clips_without_a_loss": sum(p.done and p.lost is None for p in parts),
-        "losses": len(lost), "came_back": len(back),
+        "losses": len(lost),
+        "came_back": len(back),
         "away_s": float(away.mean()) if len(away) else None,
         "away_most_s": float(away.max()) if len(away) else None,
         "falls_for_good": int(not parts[-1].done and parts[-1].begins is None),
-        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    }  # fmt: skip
+        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+    }
 
 
 def hour_rows(places: Places, raws: Raws) -> Iterator[Figure]:

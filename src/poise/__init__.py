@@ -16,10 +16,10 @@ What is heavy is imported when it is first used.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from poise.errors import PoiseError
+from poise.lazy import lazy
 from poise.version import __version__
 
 if TYPE_CHECKING:
@@ -38,29 +38,6 @@ if TYPE_CHECKING:
     from poise.motion import Clip, ClipLibrary
     from poise.recipes import ResidualForce
     from poise.recipes.perpetual_settings import Perpetual
-
-#: Where each name of the face is; it has the same name there unless another one follows.
-_PLACES = {
-    "Clip": "poise.motion",
-    "ClipLibrary": "poise.motion",
-    "Dream": "poise.jobs.endless.dreamt",
-    "Dreamt": "poise.jobs.endless.dreamt",
-    "Inbetween": "poise.jobs.inbetween.inbetween_settings",
-    "Perpetual": "poise.recipes.perpetual",
-    "ResidualForce": "poise.recipes",
-    "Result": "poise.jobs.result",
-    "Run": "poise.jobs.open",
-    "TrackConfig": "poise.jobs.track",
-    "complete": "poise.jobs.complete",
-    "dream": "poise.jobs.endless.dreaming",
-    "imitate": "poise.jobs.imitate",
-    "inbetween": "poise.jobs.inbetween.fill",
-    "open_run": "poise.jobs.open",
-    "push": "poise.jobs.push",
-    "read": "poise.kinematics.rate:read_clip",
-    "track": "poise.jobs.track",
-    "write": "poise.formats:write_clip",
-}
 
 __all__ = [
     "Clip",
@@ -87,13 +64,26 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module 'poise' has no attribute '{name}'")
-    module, _, there = _PLACES[name].partition(":")
-    found = getattr(import_module(module), there or name)
-    globals()[name] = found
-    return found
+__getattr__ = lazy(
+    __name__,
+    {
+        "formats": "write=write_clip",
+        "jobs.complete": "complete",
+        "jobs.endless.dreaming": "dream",
+        "jobs.endless.dreamt": "Dream Dreamt",
+        "jobs.imitate": "imitate",
+        "jobs.inbetween.fill": "inbetween",
+        "jobs.inbetween.inbetween_settings": "Inbetween",
+        "jobs.open": "Run open_run",
+        "jobs.push": "push",
+        "jobs.result": "Result",
+        "jobs.track": "TrackConfig track",
+        "kinematics.rate": "read=read_clip",
+        "motion": "Clip ClipLibrary",
+        "recipes.residual_force_settings": "ResidualForce",
+        "recipes.perpetual_settings": "Perpetual",
+    },
+)
 
 
 def __dir__() -> list[str]:

@@ -413,7 +413,7 @@ def check_data(kind: type, data: Any, where: Path | str | None = None, name: str
     if missing:
         hint = "The file is damaged, or of another kind"
         raise PoiseError(f"'{missing[0]}' is missing{inside}", where, hint, code="key-missing")
-    for key, one in _types(kind).items():
+    for key, one in types_of(kind).items():
         if key in data:
             _value(one, data[key], f"{name}.{key}" if name else key, where)
 
@@ -465,7 +465,8 @@ def imported(place: str) -> Any:
 
 
 @cache
-def _types(kind: type) -> dict[str, Any]:
+def types_of(kind: type) -> dict[str, Any]:
+    """The types of a settings class by field, with those of parts of other modules, see `part`."""
     places = _places(kind)
     hints = get_type_hints(
         kind, localns={p.partition(":")[2]: imported(p) for p in places.values()} or None
@@ -487,7 +488,7 @@ def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:
         raise PoiseError(
             f"{what} must be a table of settings, got {_short(data)}", where, code="wrong-type"
         )
-    types = {f.name: _types(kind)[f.name] for f in fields(kind) if f.init}
+    types = {f.name: types_of(kind)[f.name] for f in fields(kind) if f.init}
     unknown = [k for k in data if k not in types]
     if unknown:
         near = did_you_mean(str(unknown[0]), list(types)) or f"Known: {', '.join(types)}"

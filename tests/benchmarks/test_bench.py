@@ -106,7 +106,7 @@ def test_stable_pd_moves_like_servos_with_damped_joints(imitation):
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, inertia)
     paper.write(None, reference.qpos[3:5], reference.qvel[3:5] * 0)
-    torch.testing.assert_close(paper._inertia()[0], torch.tensor(inertia))
+    torch.testing.assert_close(paper.inertia()[0], torch.tensor(inertia))
     servos = fine.env(2, auto_reset=False, threads=1).backend
     servos.write(None, reference.qpos[3:5], reference.qvel[3:5])
     paper.write(None, reference.qpos[3:5], reference.qvel[3:5])

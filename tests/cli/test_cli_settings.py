@@ -51,7 +51,7 @@ def trains(*argv: str) -> Any:
 def test_options_are_those_of_the_class(group: type, recipe: str) -> None:
     kind = KINDS[recipe]
     assert imported(SOURCES[recipe]) is kind
-    types, plain = settings._types(kind), kind()
+    types, plain = settings.types_of(kind), kind()
     hints = get_type_hints(group, include_extras=True)
     own = {name for name in hints if name in types} - {"noise", "style", "teacher"}
     assert len(own) >= 2

@@ -169,7 +169,7 @@ def test_a_get_up_that_is_lost_is_tried_in_another_way(tracker: Tracker, task: I
         assert goal.doing.tolist() == [FALLS] and goal.rows()["vain"].tolist() == [tries]
         goal.watch(lies, goal.layout.unpacked(goal.now()).pos + 2.0, still)
         assert goal.doing.tolist() == [RETURNS]
-        took.append(int(goal._length))
+        took.append(int(goal.rows()["length"]))
     assert took[1] > took[0]
     # Once it is back, the next fall begins anew.
     while goal.doing.tolist() == [RETURNS]:

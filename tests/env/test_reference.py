@@ -100,6 +100,28 @@ def test_worlds_of_one_batch_may_be_in_different_cycles_and_clips():
     torch.testing.assert_close(many.pos[2], ref.pose.pos[-1])
 
 
+def test_what_is_told_apart_stays_so_joined_and_elsewhere():
+    ref = reference_of(swing(1.0), swing(0.5, name="short"))
+    motions = [q.numpy() + 0.01 for q in ref.qpos.split(ref.length.tolist())]
+    told, elsewhere = ref.told(motions), torch.device("meta")
+    assert told.misleads and not ref.misleads
+    assert torch.equal(told.goal_rows.judged, ref.goal_rows.judged)
+    both = ref.joined(told)
+    # The rows of the second reference come after the 47 of the first one.
+    rows, goal = both.follow(at(35, 47 + 35, 47 + 46), at(1, 3, 3), at(4, 4, 15))
+    assert rows.tolist() == [36, 47 + 36, 47 + 46] and both.misleads
+    want = ref.goal_rows.told[36], told.goal_rows.told[36], told.goal_rows.told[46]
+    assert torch.equal(goal, torch.stack(want)) and not torch.equal(want[0], want[1])
+    assert torch.equal(both.packed(rows), ref.packed(at(36, 36, 46)))
+    for own in (ref, told, both):
+        there = own.to(elsewhere)
+        assert there.misleads == own.misleads and there.goal_rows.after.device == elsewhere
+        assert there.goal_rows.told.device == there.qpos.device == elsewhere
+    # With other goals for all there is one thing to tell.
+    again = told.with_pose(ref.pose)
+    assert not again.misleads and torch.equal(again.goal_rows.judged, ref.goal_rows.judged)
+
+
 def test_velocities_are_those_of_the_path():
     ref = reference_of(swing(1.0, speed=1.2))
     pos = ref.pose.pos

@@ -165,9 +165,8 @@ def test_no_step_mixes_devices(make_task, settings):
         for value in (out.obs, out.reward, out.terminated, out.truncated, env.pose().linvel):
             assert value.device == env.device
         env.pose()
-        ids = torch.arange(2, device=ELSEWHERE)
-        ahead = env.goal.ahead()[ids]
-        env._terms.observe(env._sources.of({"goal": ahead, "ahead": ahead}, ids))
+        some = env.observe(torch.arange(2, device=ELSEWHERE))
+        assert some.device == env.device and some.shape == (2, env.num_obs)
         env.reset()
 
 
@@ -178,7 +177,7 @@ def test_phcs_terms_mix_no_devices_either(make_phc):
         env = ImitationEnv(task.reference, FakeBackend(task.model), quiet, 2)
         out = env.step(torch.zeros(N, env.num_actions, device=ELSEWHERE))
         rows = torch.arange(5, device=ELSEWHERE)
-        seen = env._clip_features._of(rows)
+        seen = env.clip_features(rows)
         for value in (out.obs, out.reward, out.terminated, env.features(), seen, env.terms["energy"]):
             assert value.device == env.device
         assert seen.shape == (5, env.num_features)

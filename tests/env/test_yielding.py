@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from poise.control import Compliance, Stiffness
+from poise.control.compliance import columns
 from poise.env import ImitationEnv
 from poise.env.pushes import Pushes
 from poise.env.scene_events import InScene, SetDown, touches_of
@@ -18,7 +19,7 @@ from poise.learn import PPOConfig
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
-from poise.sim import Character, Link, Scene, SceneSim, Touch
+from poise.sim import Character, Drive, Link, Scene, SceneSim, Touch
 from poise.sim.props import Ball, Carrier
 from refusals import refused
 from toy_human import swing
@@ -63,17 +64,20 @@ def test_u_is_that_of_a_naive_twin_in_every_physics_step(task: Imitation, law: s
     event, goal, model = part(env), env.goal, env.backend.model
     assert isinstance(goal, DisplacedGoal)
     body, h, seen = hand(task) + 1, float(model.opt.timestep), 0
-    weights = event._weights.numpy()
-    move = event._move
+    substeps = task.config.sim.substeps
+    weights = columns(task.humanoid.table, event.given.weights, event.given.root).numpy()
+    move, pushes, count = event.before_substep, env.event(Pushes), 0
+    assert pushes is not None
 
-    def watched(felt: list) -> None:  # type: ignore[type-arg]
-        nonlocal seen
+    def watched(drive: Drive) -> None:
+        nonlocal seen, count
         before, rate = goal.offset.clone().numpy(), goal.rate.clone().numpy()
         want, moves = before.copy(), []
         refs = [goal.goal.layout.unpacked(p) for p in (goal.goal.now(), goal.goal.ahead())]
-        at = event._k / event._substeps
+        at, told = count % substeps / substeps, pushes.felt()
+        count += 1
         for n in range(env.num_envs):
-            force = felt[0].force[n, 0].numpy()
+            force = told.force[n, 0].numpy()
             if np.linalg.norm(force) < 1.0:
                 w = 2 * np.pi * event.given.return_hz
                 slope = rate[n] + w * before[n]
@@ -105,14 +109,14 @@ def test_u_is_that_of_a_naive_twin_in_every_physics_step(task: Imitation, law: s
             inverse = np.linalg.pinv(jac @ w @ jac.T, rcond=1e-4, hermitian=True)
             want[n] = before[n] + h * 0.3 * w @ jac.T @ inverse @ velocity
             moves.append(n)
-        move(felt)
+        move(drive)
         free = event.share.numpy() == 1.0
         for n in range(env.num_envs):
             if free[n] or n not in moves:
                 np.testing.assert_allclose(goal.offset[n].numpy(), want[n], atol=1e-9, rtol=0)
                 seen += n in moves
 
-    event._move = watched  # type: ignore[method-assign]
+    event.before_substep = watched  # type: ignore[method-assign]
     for _ in range(8):
         env.step(still(env))
     assert seen > 20 and float(goal.offset.abs().max()) > 1e-3

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from handmade_motion_files import BVH_HEADER, bvh_rows, bvh_text, put
 
 from poise.errors import PoiseError
@@ -44,8 +43,8 @@ def same(a: Clip, b: Clip) -> tuple[float, float]:
     """Largest distance in mm and angle in degrees between two clips, joints matched by name."""
     at = [b.skeleton.index(n) for n in a.skeleton.names]
     distance = np.linalg.norm(a.positions() - b.positions()[:, at], axis=-1).max() * 1e3
-    turn = quat_mul(quat_conj(torch.tensor(a.rot)), torch.tensor(b.rot[:, at]))
-    return float(distance), float(torch.rad2deg(quat_angle(turn).max()))
+    turn = quat_mul(quat_conj(a.rot), b.rot[:, at])
+    return float(distance), float(np.rad2deg(quat_angle(turn).max()))
 
 
 def test_rest_pose_stands_in_z_up(tmp_path: Path) -> None:
@@ -65,10 +64,10 @@ def test_rotation_order_is_the_channels_order(tmp_path: Path) -> None:
     # Head: Y 90 then X 90, intrinsic: R = Ry Rx takes file y to Ry(z) = x.
     row = " ".join(["0 90 0"] + ["0"] * 6 + ["90 90 0"] + ["0"] * 6)
     clip = read_clip(put(tmp_path, "a.bvh", bvh_text([row] * 3)))
-    tip = torch.tensor([[0.0, 0.0, 0.2]], dtype=torch.float64)  # file (0, 20, 0) cm
+    tip = np.array([[0.0, 0.0, 0.2]], dtype=float)  # file (0, 20, 0) cm
     from poise.motion.rotations import quat_rotate
 
-    got = quat_rotate(torch.tensor(clip.rot[:1, 2]), tip)[0].numpy()
+    got = quat_rotate(clip.rot[:1, 2], tip)[0]
     np.testing.assert_allclose(got, [0.2, 0.0, 0.0], atol=1e-12)
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from handmade_gltf_files import QUARTER_X, Gltf, person, put, turn
 from handmade_motion_files import bvh_text, deepmimic_text
 
@@ -56,8 +55,8 @@ def difference(a: Clip, b: Clip) -> tuple[float, float]:
     assert [j for j, _ in a.skeleton.ends] == [j for j, _ in b.skeleton.ends]
     for (_, tip), (_, other) in zip(a.skeleton.ends, b.skeleton.ends, strict=True):
         np.testing.assert_allclose(tip, other, atol=1e-6)
-    angle = quat_distance(torch.tensor(a.rot), torch.tensor(b.rot)).max()
-    return float(np.abs(a.positions() - b.positions()).max() * 1e3), float(torch.rad2deg(angle))
+    angle = quat_distance(a.rot, b.rot).max()
+    return float(np.abs(a.positions() - b.positions()).max() * 1e3), float(np.rad2deg(angle))
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -98,5 +99,10 @@ def test_modules_beside_the_users_files_are_not_imported(
 
 def test_every_script_that_reads_apart_is_there() -> None:
     # Tests of these formats are skipped where their packages are missing, and so would miss it.
-    for module in (c3d, fbx, usd, limited, mjcf):
-        assert module._SCRIPT.is_file(), module.__name__
+    scripts = {
+        path.with_name(name)
+        for module in (c3d, fbx, usd, limited, mjcf)
+        for path in [Path(module.__file__)]
+        for name in re.findall(r'with_name\("(\w+\.py)"\)', path.read_text(encoding="utf-8"))
+    }
+    assert len(scripts) == 5 and all(script.is_file() for script in scripts)

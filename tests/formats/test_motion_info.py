@@ -67,15 +67,14 @@ def test_lying_people_keep_their_vertical(data_dir: Path, tmp_path: Path) -> Non
 
 
 def _turned(clip, quarter: int):  # type: ignore[no-untyped-def]
-    import torch
 
     from poise.motion.rotations import quat_mul, quat_rotate
 
     half = np.pi / 4 * quarter
-    q = torch.tensor([np.cos(half), 0, 0, np.sin(half)], dtype=torch.float64)
-    pos, rot = clip.tensors()
-    rot[:, 0] = quat_mul(q.expand(len(rot), 4), rot[:, 0])
-    return clip.replaced(root_pos=quat_rotate(q.expand(len(pos), 4), pos).numpy(), rot=rot.numpy())
+    q = np.array([np.cos(half), 0, 0, np.sin(half)], dtype=float)
+    pos, rot = clip.arrays()
+    rot[:, 0] = quat_mul(np.broadcast_to(q, (len(rot), 4)), rot[:, 0])
+    return clip.replaced(root_pos=quat_rotate(np.broadcast_to(q, (len(pos), 4)), pos), rot=rot)
 
 
 def test_describe(tmp_path: Path) -> None:

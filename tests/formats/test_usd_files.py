@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from handmade_motion_files import bvh_text, deepmimic_text
 from handmade_numpy_files import odd_clip
 
@@ -40,7 +39,7 @@ def same(a: Clip, b: Clip) -> None:
     for (_, tip), (_, other) in zip(a.skeleton.ends, b.skeleton.ends, strict=True):
         np.testing.assert_allclose(tip, other, atol=1e-6)
     np.testing.assert_allclose(a.positions(), b.positions(), atol=1e-5)
-    angle = quat_distance(torch.tensor(a.rot), torch.tensor(b.rot)).max()
+    angle = quat_distance(a.rot, b.rot).max()
     assert float(angle) < 1e-4
 
 

@@ -28,7 +28,7 @@ LIBRARIES = {
 
 def fork_instead(formats: Iterable[str]) -> None:
     """Makes this process fork wherever `limited` would start one."""
-    os.environ.update(limited._ONE_THREAD)  # pyright: ignore[reportPrivateUsage]
+    os.environ.update(limited.ONE_THREAD)
     for name in sorted({x for kind in formats for x in LIBRARIES.get(kind, ())}):
         if find_spec(name.partition(".")[0]) is not None:
             import_module(name)

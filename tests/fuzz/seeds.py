@@ -80,7 +80,7 @@ def _generated(folder: Path) -> list[Seed]:
     from handmade_gltf_files import put
 
     frames, body = 6, made.LAYOUTS[0]
-    places = made._moved(body.names, body.parents, body.offsets)[0][:frames]
+    places = made.moved(body.names, body.parents, body.offsets)[0][:frames]
     names, _ = made.SKELETONS[min(made.SKELETONS)]
     turns = np.tile(np.eye(3), (frames, len(names), 1, 1))
     joints = np.linspace((0, 0, 0), (0, 1.7, 0.1), len(names)) + np.arange(frames)[:, None, None] * 0.01

@@ -158,7 +158,7 @@ def test_clips_that_are_not_come_to_are_left_three_in_a_row_at_most() -> None:
         goal.clips.clip, goal.clips.frame = goal.clips.clip + 1, torch.tensor([0])
 
     goal.leave = leave
-    led = recovering._Led(cast("Recovering", goal), torch.zeros(1, 7))
+    led = recovering.LedCharacter(cast("Recovering", goal), torch.zeros(1, 7))
     env = SimpleNamespace(given=torch.zeros(1, 1))
     away, step = math.ceil(recovering.AWAY_S) + 1, 0
 
@@ -231,7 +231,7 @@ def test_a_motion_is_given_up_where_it_is_lost_again_and_again(apart: int, ends:
     zero = torch.tensor([0])
     goal.clips = SimpleNamespace(clip=zero, frame=zero, reference=length)
     goal.aimed = torch.zeros(1, 7)
-    led = recovering._Led(cast("Recovering", goal), torch.zeros(1, 7))
+    led = recovering.LedCharacter(cast("Recovering", goal), torch.zeros(1, 7))
     env, step = cast("ImitationEnv", SimpleNamespace(given=torch.zeros(1, 1))), 0
     over = led.see(env, step)
     for k in range(30):

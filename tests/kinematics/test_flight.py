@@ -8,7 +8,6 @@ import math
 import mujoco
 import numpy as np
 import pytest
-import torch
 
 from poise.body import generate_table, make_humanoid
 from poise.formats import read_clip
@@ -53,7 +52,7 @@ def test_the_centre_of_mass_is_mujocos():
     data.qpos[:] = rng.standard_normal(humanoid.model.nq)
     mujoco.mj_normalizeQuat(humanoid.model, data.qpos)
     mujoco.mj_forward(humanoid.model, data)
-    state = Kinematics(TABLE)(torch.tensor(data.qpos))
+    state = Kinematics(TABLE)(data.qpos)
     np.testing.assert_allclose(
         centre_of_mass(TABLE, state.pos, state.quat), data.subtree_com[1], atol=1e-9
     )

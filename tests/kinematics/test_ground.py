@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import generate_table
 from poise.formats import read_clip
@@ -23,8 +22,8 @@ from toy_human import human, swing
 
 
 def lowest(qpos: np.ndarray, table) -> np.ndarray:
-    state = Kinematics(table)(torch.tensor(qpos))
-    return lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
+    state = Kinematics(table)(qpos)
+    return lowest_height(table, state.pos, state.quat).min(-1)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def still():
 
 
 def stances(qpos: np.ndarray, table, fps: float = 30.0) -> np.ndarray:
-    state = Kinematics(table)(torch.tensor(qpos))
+    state = Kinematics(table)(qpos)
     return stance_heights(table, state.pos, state.quat, fps)
 
 
@@ -178,19 +177,19 @@ def test_fitted_motions_sink_no_deeper_than_the_limit():
     assert any("0.0 mm from the clip's" in s for s in sentences)
 
 
-def step_path(fps: float = 60.0) -> torch.Tensor:
+def step_path(fps: float = 60.0) -> np.ndarray:
     """One foot: half a second down, a step of 0.6 m and 0.2 m high in half a second, half down."""
-    t = torch.linspace(0, 1, round(fps / 2), dtype=torch.float64)
-    swing_ = torch.stack(
+    t = np.linspace(0, 1, round(fps / 2))
+    swing_ = np.stack(
         (
-            0.6 * (t - torch.sin(2 * np.pi * t) / (2 * np.pi)),
+            0.6 * (t - np.sin(2 * np.pi * t) / (2 * np.pi)),
             0 * t,
-            0.1 * (1 - torch.cos(2 * np.pi * t)),
+            0.1 * (1 - np.cos(2 * np.pi * t)),
         ),
         -1,
     )
-    down = torch.zeros(round(fps / 2), 3, dtype=torch.float64)
-    return torch.cat((down, swing_, down + torch.tensor([0.6, 0.0, 0.0])))
+    down = np.zeros((round(fps / 2), 3))
+    return np.concatenate((down, swing_, down + np.array([0.6, 0.0, 0.0])))
 
 
 def test_contacts_of_an_authored_step():
@@ -204,17 +203,17 @@ def test_contacts_of_an_authored_step():
 
 
 def test_contacts_need_low_and_slow():
-    still = torch.zeros(20, 1, 3)
+    still = np.zeros((20, 1, 3))
     assert contact_labels(still, 30.0).all()
-    assert not contact_labels(still + torch.tensor([0, 0, 0.2]), 30.0).any()
-    assert contact_labels(still + torch.tensor([0, 0, 0.2]), 30.0, ground=0.2).all()
-    slide = still.clone()
-    slide[:, 0, 0] = torch.arange(20) / 30.0 * 0.5
+    assert not contact_labels(still + np.array([0, 0, 0.2]), 30.0).any()
+    assert contact_labels(still + np.array([0, 0, 0.2]), 30.0, ground=0.2).all()
+    slide = still.copy()
+    slide[:, 0, 0] = np.arange(20) / 30.0 * 0.5
     assert not contact_labels(slide, 30.0).any() and contact_labels(slide, 30.0, speed=0.6).all()
 
 
 def test_single_frames_are_closed():
-    path = torch.zeros(20, 2, 3)
+    path = np.zeros((20, 2, 3))
     path[7, 0, 2] = 0.06  # One frame out of contact.
     path[:, 1, 2] = 0.06
     path[9, 1, 2] = 0.04  # One frame in contact.

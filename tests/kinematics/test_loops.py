@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from poise.kinematics.loops import best_period, cut_loop, overlap_of, repeated
 from poise.kinematics.travel import moved_by
@@ -53,10 +52,10 @@ def test_the_period_that_is_taken_out_closes_smoothly(overlap: int) -> None:
     assert made.frames == one.frames
     if overlap:
         np.testing.assert_allclose(made.root_pos[0], made.root_pos[-1], atol=1e-9)
-        apart = quat_distance(torch.tensor(made.rot[0]), torch.tensor(made.rot[-1]))
+        apart = quat_distance(made.rot[0], made.rot[-1])
         assert float(apart.max()) < 1e-6
     again = repeated(made, overlap, 3)
-    shake = jerk(torch.tensor(again.positions()), again.fps).numpy()
+    shake = jerk(again.positions(), again.fps)
     seam = np.zeros(len(shake), dtype=bool)
     for k in (1, 2):
         seam[60 * k - 3 : 60 * k + 1] = True
@@ -67,7 +66,7 @@ def test_what_several_periods_do_alike_is_kept() -> None:
     one = walker(1.0, fps=60.0)
     made = best_period(repeated(one, 1, 4), 60, 1)
     np.testing.assert_allclose(made.root_pos, one.root_pos, atol=1e-9)
-    assert float(quat_distance(torch.tensor(made.rot), torch.tensor(one.rot)).max()) < 1e-6
+    assert float(quat_distance(made.rot, one.rot).max()) < 1e-6
 
 
 def test_even_drift_is_taken_off_evenly() -> None:
@@ -106,17 +105,12 @@ def test_a_loop_is_cut_where_its_end_meets_its_start() -> None:
     # The last frame is the first, turned and gone on.
     np.testing.assert_allclose(np.abs((made.rot[0] * made.rot[-1]).sum(-1))[1:], 1.0, atol=1e-9)
     assert made.root_pos[-1, 2] == pytest.approx(made.root_pos[0, 2])
-    onto = quat_mul(
-        heading_quat(torch.tensor(made.rot[-1, 0])),
-        quat_conj(heading_quat(torch.tensor(made.rot[0, 0]))),
-    )
+    onto = quat_mul(heading_quat(made.rot[-1, 0]), quat_conj(heading_quat(made.rot[0, 0])))
     # Gone on with, the seam is no rougher than the motion.
     pos = made.positions()
-    ahead = quat_rotate(onto.expand(8, pos.shape[1], 4), torch.tensor(pos[1:9] - made.root_pos[0]))
+    ahead = quat_rotate(np.broadcast_to(onto, (8, pos.shape[1], 4)), pos[1:9] - made.root_pos[0])
     base = made.root_pos[-1] * [1.0, 1.0, 0.0] + made.root_pos[0] * [0.0, 0.0, 1.0]
-    rough = np.linalg.norm(
-        np.diff(np.concatenate((pos, ahead.numpy() + base)), 3, axis=0), axis=-1
-    ).mean(1)
+    rough = np.linalg.norm(np.diff(np.concatenate((pos, ahead + base)), 3, axis=0), axis=-1).mean(1)
     assert rough[made.frames - 4 :].max() < 1.3 * rough[: made.frames - 20].max()
     # Frames before the join are the motion's own.
     own = clip.positions()

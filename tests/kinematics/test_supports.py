@@ -42,7 +42,7 @@ def test_one_that_sits_gets_a_seat_under_its_hips(tracker: Tracker, name: str, b
     assert seat.kind == "seat"
     assert abs(seat.top - under) < 0.08
     # From the hips on forward, below the pelvis.
-    hips = pos[at, 0, :2].numpy() - np.array(seat.pos[:2])
+    hips = pos[at, 0, :2] - np.array(seat.pos[:2])
     assert np.abs(hips).max() < 0.25
     assert abs(hips[1]) < 0.05
     weight = 9.81 * sum(r.mass for r in table.rows)
@@ -70,7 +70,9 @@ def test_a_walk_gets_nothing(tracker: Tracker):
     still = clip.replaced(root_pos=clip.root_pos[:12], rot=clip.rot[:12])
     assert found(still, tracker) == ()
     r = imitation_of(tracker, [place(walk(), tracker)]).reference
-    assert find_supports(tracker.humanoid.table, r.pose.pos, r.pose.quat, r.rate_hz) == ()
+    assert (
+        find_supports(tracker.humanoid.table, r.pose.pos.numpy(), r.pose.quat.numpy(), r.rate_hz) == ()
+    )
 
 
 def test_what_stands_still_asks_for_its_weight(tracker: Tracker):
@@ -148,6 +150,6 @@ def test_a_file_that_makes_no_sense_is_refused(tmp_path: Path, text: str, said: 
 def test_poses_are_doubles(tracker: Tracker):
     clip, table = motion("sit_chair", tracker), tracker.humanoid.table
     pos, quat = poses_of(clip, table)
-    single = find_supports(table, pos.float(), quat.float(), clip.fps)
+    single = find_supports(table, pos.astype(np.float32), quat.astype(np.float32), clip.fps)
     assert len(single) == 1
     assert single[0].size == pytest.approx(found(clip, tracker)[0].size, abs=0.05)

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from poise.kinematics import examine, heal
 from poise.kinematics.travel import find_travel, in_place, travelled
@@ -66,7 +65,7 @@ def test_taking_the_travel_out_undoes_it() -> None:
         assert travel is not None
         back = in_place(travelled(clip, travel), travel)
         np.testing.assert_allclose(back.root_pos, clip.root_pos, atol=1e-12)
-        assert quat_distance(torch.tensor(back.rot), torch.tensor(clip.rot)).max() < 1e-6
+        assert quat_distance(back.rot, clip.rot).max() < 1e-6
 
 
 def test_a_clip_that_travels_is_not_in_place() -> None:
@@ -137,7 +136,7 @@ def test_a_mended_loop_stays_in_place_and_closes() -> None:
     turn = np.stack((np.cos(half), 0 * half, np.sin(half), 0 * half), -1)
     from poise.motion.rotations import quat_mul
 
-    rot[:, j] = quat_mul(torch.tensor(turn), torch.tensor(rot[:, j])).numpy()
+    rot[:, j] = quat_mul(turn, rot[:, j])
     healed = heal(clip.replaced(rot=rot))
     assert healed.frames == clip.frames
     assert np.ptp(healed.root_pos[:, :2], axis=0).max() < 0.1
@@ -148,9 +147,9 @@ def turned(clip: Clip, angle: float) -> Clip:
     """The clip turned about the vertical."""
     from poise.motion.rotations import axis_angle_to_quat, quat_mul, quat_rotate
 
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    turn = axis_angle_to_quat(up, torch.tensor(angle, dtype=torch.float64))
-    rot = torch.tensor(clip.rot)
-    rot[:, 0] = quat_mul(turn.expand(len(rot), 4), rot[:, 0])
-    root = quat_rotate(turn.expand(len(rot), 4), torch.tensor(clip.root_pos))
-    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy())
+    up = np.array([0.0, 0.0, 1.0], dtype=float)
+    turn = axis_angle_to_quat(up, np.asarray(angle, dtype=float))
+    rot = clip.rot.copy()
+    rot[:, 0] = quat_mul(np.broadcast_to(turn, (len(rot), 4)), rot[:, 0])
+    root = quat_rotate(np.broadcast_to(turn, (len(rot), 4)), clip.root_pos)
+    return clip.replaced(root_pos=root, rot=rot)

@@ -93,7 +93,7 @@ def test_one_step_descends_the_whole_loss():
     loss = loss + 1.7 * slope.square().sum(-1).mean() + 0.3 * w2.square().sum()
     loss = loss + 0.2 * (w1.square().sum() + w2.square().sum())
     grads = torch.autograd.grad(loss, params)
-    numbers = amp._fit(agent, demo)
+    numbers = amp.descend(agent, demo)
     for p, old, g in zip(params, before, grads, strict=True):
         torch.testing.assert_close(p.detach(), old - g, rtol=1e-4, atol=1e-6)
     assert numbers["demo_accuracy"] == pytest.approx(float((real > 0).float().mean()))
@@ -154,7 +154,7 @@ def test_the_total_reward_is_the_weighted_sum(past):
 
     style.reward = spy  # type: ignore[method-assign]
     stats = trainer.iterate()
-    given = style._style
+    given = style.style_rewards
     # Windows fill after FRAMES steps.
     assert given[: FRAMES - 1].isnan().all() and not given[FRAMES - 1].isnan().any()
     filled = given.nan_to_num(float(given[~given.isnan()].mean()))

@@ -84,11 +84,11 @@ def test_the_truth_has_no_loss_and_slides_where_contact_is_said() -> None:
     mats = quat_to_matrix(batch.rot)
     truth = matrix_kinematics(frames.layout.parents, batch.offsets.unsqueeze(1), batch.root, mats)
     logits = torch.full((1, 20, 4), -30.0, requires_grad=True)
-    parts = learner._parts(GapFrames(batch.root, mats, logits), truth, batch, known)
+    parts = learner.parts(GapFrames(batch.root, mats, logits), truth, batch, known)
     for name in ("pos", "quat", "velocity"):
         assert float(parts[name]) == pytest.approx(0.0, abs=2e-4)
     sure = GapFrames(batch.root, mats, torch.full((1, 20, 4), 30.0, requires_grad=True))
-    moved = learner._parts(sure, truth, batch, known)["slide"]
+    moved = learner.parts(sure, truth, batch, known)["slide"]
     step = torch.diff(truth[0][:, :, list(frames.layout.feet)], dim=1)[:, 9:19].norm(dim=-1)
     held = torch.ones(10, 4)
     held[9] = batch.contact[0, 19]

@@ -76,13 +76,18 @@ def test_time_outs_are_bootstrapped_with_the_state_reached():
 
 
 def test_rescaled_returns_leave_the_values_unchanged():
-    ppo = PPO(4, 2, TOY, seed=0)
+    # Nothing is learned, so that the scale of the returns alone changes.
+    ppo = PPO(4, 2, replace(TOY, policy_lr=1e-12, value_lr=1e-12), seed=0)
     obs = torch.randn(50, 4, generator=torch.Generator().manual_seed(1))
-    ppo._rescale_critic(5 + 3 * torch.randn(200, generator=torch.Generator().manual_seed(2)))
-    before = ppo.value(obs)
-    assert 4 < float(before.detach().mean()) < 6  # A fresh critic predicts the mean return.
-    ppo._rescale_critic(100 + 30 * torch.randn(300, generator=torch.Generator().manual_seed(3)))
-    assert float(ppo.return_norm.std) > 20
+    first, second = filled(ppo), filled(ppo, seed=1)
+    ppo.update(first)
+    before, returns = ppo.value(obs).detach(), first.returns
+    # A fresh critic predicts the mean return.
+    assert abs(float(before.mean() - returns.mean())) < 0.5 * float(returns.std())
+    second.reward.mul_(10.0)
+    ppo.update(second)
+    assert float(ppo.return_norm.std) > 3 * float(returns.std())
+    assert abs(float(ppo.return_norm.mean - before.mean())) > 100
     torch.testing.assert_close(ppo.value(obs), before, rtol=1e-4, atol=1e-4)
 
 
@@ -167,7 +172,7 @@ def test_a_smooth_policy_answers_alike_to_states_that_are_near():
 
 def test_a_policy_may_be_smooth_over_some_columns_alone():
     ppo = PPO(4, 2, replace(TOY, smooth_weight=1.0, smooth_over=(1, 3)), seed=0)
-    near = ppo._near(torch.zeros(8, 4))
+    near = ppo.near(torch.zeros(8, 4))
     assert (near[:, [0, 3]] == 0).all() and near[:, 1:3].std() == pytest.approx(0.8, rel=0.1)
     with refused("not-rising", says="smooth_over"):
         replace(TOY, smooth_over=(3, 3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from poise.live.stream import FADE_S, JitterBuffer, margin
-from poise.motion import quats as q
+from poise.motion.rotations import ahead_angle, yaw_quat
 
 STILL = np.array([[1.0, 0, 0, 0]])
 
@@ -46,10 +46,10 @@ def test_without_a_buffer_it_is_extrapolated_and_comes_to_rest() -> None:
 def test_rotations_go_on_turning() -> None:
     buffer = JitterBuffer(0.0)
     for k in range(3):
-        buffer.add(k / 30, 100 + k / 30, np.zeros(3), q.yaw(0.1 * k)[None])
+        buffer.add(k / 30, 100 + k / 30, np.zeros(3), yaw_quat(0.1 * k)[None])
     pose = buffer.read(100 + 2 / 30 + 0.01)
     assert pose is not None
-    assert q.heading(pose.rot[0]) == pytest.approx(0.2 + 3 * FADE_S * (1 - np.exp(-0.1)), abs=1e-9)
+    assert ahead_angle(pose.rot[0]) == pytest.approx(0.2 + 3 * FADE_S * (1 - np.exp(-0.1)), abs=1e-9)
 
 
 def test_jumps_are_told_once_and_not_walked_through() -> None:

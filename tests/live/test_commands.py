@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -141,11 +142,11 @@ def test_the_newest_wins_and_queues_are_bounded() -> None:
     assert source.inbox.crowded == 10
     line = source.inbox.take()["a"]
     assert len(line) == WAIT and line[-1][1].time_s == WAIT + 9
-    for k in range(PEOPLE + 5):
-        source._skeletons.clear()
-        source._skeletons[f"p{k}"] = stream()._skeletons["a"]
-        source.receive(pose(f"p{k}"), 0.0)
-    assert source.inbox.refused["too many people"] == 5
+    # As many people as may come, and five more, by several doors.
+    one = line[-1][1]
+    taken = [source.inbox.offer(replace(one, person=f"p{k}"), 0.0) for k in range(PEOPLE + 5)]
+    assert taken == [True] * PEOPLE + [False] * 5
+    assert source.inbox.refused["too many people"] == 5 and len(source.inbox.take()) == PEOPLE
 
 
 def test_who_comes_in() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from majority import majority
 from poise.formats import read_clip
@@ -295,18 +296,30 @@ def test_whole_turns_of_a_fallen_character_are_left_out(tracker: Tracker, walk: 
     """The pose stays where it is, and so do the bodies."""
     played = Played(tracker, walk, LiveConfig())
     played.run(0.3)
-    world = played.live.world
+    world, recovery = played.live.world, tracker.recovery_clips
+    assert recovery is not None
+    character = world.characters[0]
     joint = int((world.humanoid.model.jnt_range[1:, 0] < -8.0).nonzero()[0][0])
     state = world.rows.state
-    qpos, qvel = state.qpos.clone(), state.qvel.clone()
-    qpos[0, 7 + joint] -= 2 * np.pi
-    world.rows.write(None, qpos, qvel)
-    before = state.xpos.clone()
-    world._unwind()
-    assert world.unwound == 0
-    world.characters[0]._fall()
-    world._unwind()
-    assert world.unwound == 1
+    for falls in (False, True):
+        if falls:
+            # It lies where it stood, and slides.
+            lies, slides = state.qpos.clone(), torch.zeros_like(state.qvel)
+            lies[0, 2:] = recovery.ups[0][0, 2:].to(lies)
+            slides[0, 0] = 4.0
+            world.rows.write(None, lies, slides)
+            played.run(2 * STEP)
+        assert (character.doing == FALLS) == falls and world.unwound == 0
+        qpos, qvel = state.qpos.clone(), state.qvel.clone()
+        qpos[0, 7 + joint] -= 2 * np.pi
+        world.rows.write(None, qpos, qvel)
+        before = state.xpos.clone()
+        world.unwind()
+        assert world.unwound == falls
+        if not falls:
+            assert torch.equal(state.qpos, qpos)
+            qpos[0, 7 + joint] += 2 * np.pi
+            world.rows.write(None, qpos, qvel)
     assert np.allclose(state.qpos[0, 7 + joint], qpos[0, 7 + joint] + 2 * np.pi, atol=1e-5)
     assert np.allclose(state.xpos, before, atol=1e-4) and np.allclose(state.qvel, qvel)
     played.live.close()

@@ -149,7 +149,7 @@ def test_strangers_are_kept_out(served: Served) -> None:
         for one in made:
             one.close()
     end = time.monotonic() + 5
-    while time.monotonic() < end and served.guard._open.total():
+    while time.monotonic() < end and served.guard.inside:
         time.sleep(0.02)
     assert served.get("/")[0] == 200
 

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 
+from poise.env.reference import Poser
 from poise.env.stream_goal import StreamGoal
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.kinematics.retarget.passage import world_of
+from poise.kinematics.retargeting.passage import world_of
 from poise.live.characters import TRACKS
 from poise.live.points import PointFit
 from poise.live.protocol import LiveConfig
@@ -27,7 +28,7 @@ from poise.live.sockets import StreamDoor
 from poise.live.sources import JsonStream, KeypointFrame
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
-from poise.motion import quats as q
+from poise.motion.rotations import quat_rotate
 from test_docs import ROOT, WALK
 
 STEP = 1 / 30
@@ -59,7 +60,7 @@ def joints(packet: Packet) -> dict[str, np.ndarray]:
     skeleton, world = packet.skeleton, world_of(packet.skeleton, packet.rot)
     out = [packet.root_pos]
     for j, parent in enumerate(skeleton.parents[1:], 1):
-        out.append(out[parent] + q.rotate(world[parent], skeleton.offsets[j]))
+        out.append(out[parent] + quat_rotate(world[parent], skeleton.offsets[j]))
     return dict(zip(skeleton.names, out, strict=True))
 
 
@@ -259,7 +260,7 @@ def test_a_policy_of_keypoints_is_told_the_points_and_another_one_the_fit(walk: 
     live, inbox = Live(tracker, LiveConfig(buffer_s=0.0), clock=lambda: 0.0), Inbox()
     fit = PointFit(live.inbox, tracker.example, tracker.humanoid.table, tells_places=True)
     plain = PointFit(inbox, tracker.example, tracker.humanoid.table)
-    names, apart, told = walk.skeleton.names, list[float](), 0
+    names, apart, told, poser = walk.skeleton.names, list[float](), 0, Poser(tracker.humanoid)
     last: np.ndarray | None = None
     for now, points in film(walk, 30.0, 4.5, stands=3.5):
         fit.fit(KeypointFrame("a", names, points, now, now))
@@ -285,7 +286,7 @@ def test_a_policy_of_keypoints_is_told_the_points_and_another_one_the_fit(walk: 
         assert np.allclose(newest.pos[0].numpy(), places, atol=1e-4)
         # What the coordinates would have told is another thing, by centimetres.
         made = goal.coordinates(torch.tensor([0]), goal.count - 1)
-        fk = goal._poser.live(*made).pos[0].numpy()
+        fk = poser.live(*made).pos[0].numpy()
         apart.append(float(np.linalg.norm(fk - places, axis=-1).mean()))
         told += 1
     assert told > 10

@@ -8,7 +8,7 @@ import pytest
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.kinematics.retarget.passage import world_of
+from poise.kinematics.retargeting.passage import world_of
 from poise.kinematics.stream_noise import LATE_S
 from poise.live.people import Person, Steady
 from poise.live.points import PointFit
@@ -16,7 +16,7 @@ from poise.live.session import _of_tremble
 from poise.live.sources import KeypointFrame, Loop
 from poise.live.stream import Inbox, JitterBuffer, Packet, StreamTremble, margin
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import normalize, quat_mul, quat_rotate
 from test_docs import WALK
 
 STEP = 1 / 30
@@ -42,8 +42,8 @@ def stream(walk: Clip, seconds: float, turn: float, hz: float = 0.0, name: str =
         err = rng.normal(size=phase.shape)
         if hz:
             err = np.sqrt(2) * np.sin(2 * np.pi * (hz * k / walk.fps + phase))
-        turned = q.normalized(np.concatenate((np.ones((len(err), 1)), 0.5 * turn * err), 1))
-        out.append(Packet(name, k / walk.fps, walk.skeleton, root, q.mul(rot, turned), walk))
+        turned = normalize(np.concatenate((np.ones((len(err), 1)), 0.5 * turn * err), 1))
+        out.append(Packet(name, k / walk.fps, walk.skeleton, root, quat_mul(rot, turned), walk))
     return out
 
 
@@ -51,7 +51,7 @@ def places(skeleton: Skeleton, root: np.ndarray, rot: np.ndarray) -> np.ndarray:
     """`(J, 3)` m."""
     world, out = world_of(skeleton, rot), [root]
     for j, parent in enumerate(skeleton.parents[1:], 1):
-        out.append(out[parent] + q.rotate(world[parent], skeleton.offsets[j]))
+        out.append(out[parent] + quat_rotate(world[parent], skeleton.offsets[j]))
     return np.stack(out)
 
 
@@ -79,7 +79,7 @@ def test_a_clean_stream_is_left_alone_and_no_later(walk: Clip) -> None:
         inbox.offer(packet, packet.time_s)
         ((_, came),) = inbox.take()["a"]
         # As it came but for its length, which is made one.
-        np.testing.assert_array_equal(came.rot, q.normalized(packet.rot))
+        np.testing.assert_array_equal(came.rot, normalize(packet.rot))
         assert came.root_pos is packet.root_pos and came.earlier == ()
         assert came.tremble is not None and came.tremble.mm == came.tremble.late_s == 0.0
 

@@ -11,7 +11,7 @@ import pytest
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.kinematics.retarget.passage import world_of
+from poise.kinematics.retargeting.passage import world_of
 from poise.live.people import Calibration
 from poise.live.protocol import LiveConfig
 from poise.live.session import Live
@@ -34,7 +34,7 @@ from poise.live.vmc import (
     to_unity,
 )
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import normalize, quat_rotate, yaw_quat
 from refusals import refused
 from test_docs import WALK
 
@@ -43,7 +43,7 @@ def joints(skeleton: Skeleton, root: np.ndarray, rot: np.ndarray) -> np.ndarray:
     """`(J, 3)` m."""
     world, out = world_of(skeleton, rot), [root]
     for j, parent in enumerate(skeleton.parents[1:], 1):
-        out.append(out[parent] + q.rotate(world[parent], skeleton.offsets[j]))
+        out.append(out[parent] + quat_rotate(world[parent], skeleton.offsets[j]))
     return np.stack(out)
 
 
@@ -69,10 +69,10 @@ def test_unity_is_left_handed_with_y_up() -> None:
     np.testing.assert_allclose(pos, [[0, 0, 1], [-1, 0, 0], [0, 1, 0]])
     # A quarter turn to the left about Poise's +Z takes ahead to left; in Unity +Z to -X, which is a
     # turn by -90 degrees about +Y.
-    _, turn = to_unity(np.zeros(3), q.yaw(np.pi / 2))
+    _, turn = to_unity(np.zeros(3), yaw_quat(np.pi / 2))
     np.testing.assert_allclose(turn, [0, -np.sqrt(0.5), 0, np.sqrt(0.5)])
     rng = np.random.default_rng(0)
-    p, r = rng.normal(size=(9, 3)), q.normalized(rng.normal(size=(9, 4)))
+    p, r = rng.normal(size=(9, 3)), normalize(rng.normal(size=(9, 4)))
     back = from_unity(*to_unity(p, r))
     np.testing.assert_allclose(back[0], p)
     np.testing.assert_allclose(back[1], r)
@@ -80,7 +80,7 @@ def test_unity_is_left_handed_with_y_up() -> None:
     v = rng.normal(size=(9, 3))
     there, turns = to_unity(v, r)
     unity = np.concatenate((turns[:, 3:], turns[:, :3]), 1)
-    np.testing.assert_allclose(q.rotate(unity, there), to_unity(q.rotate(r, v), r)[0], atol=1e-12)
+    np.testing.assert_allclose(quat_rotate(unity, there), to_unity(quat_rotate(r, v), r)[0], atol=1e-12)
 
 
 def test_what_goes_out_comes_in_within_a_millimetre() -> None:
@@ -185,8 +185,10 @@ def test_in_through_the_body_and_out_agree_to_a_millimetre_on_the_wire() -> None
         skeleton, hips, rot = avatar(seen.goals[0], seen.goals[0], own)
         out = [m for m in messages(datagram(skeleton, hips, rot, 1.0)) if m.address.endswith("Bone/Pos")]
         told = body_of(out)
-        here = q.yaw(own.where.yaw)
-        want = q.rotate(here, joints(own.skeleton, own.root_pos, own.rot)) + own.where.shift / own.factor
+        here = yaw_quat(own.where.yaw)
+        want = (
+            quat_rotate(here, joints(own.skeleton, own.root_pos, own.rot)) + own.where.shift / own.factor
+        )
         worst.append(float(np.abs(joints(*told) - want).max()))
         _, hips, rot = avatar(seen.bodies[0], seen.goals[0], own)
         apart = np.linalg.norm(joints(skeleton, hips, rot) - want, axis=-1).mean()

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from poise.motion.windows import joined, mirrored, mirrored_clip, other_sides
+from poise.motion.mirror import mirrored_clip, other_sides
+from poise.synthesis.windows import joined, mirrored
 from refusals import refused
 from toy_human import swing
 from toy_windows import bank
@@ -16,7 +17,7 @@ from toy_windows import bank
 def test_each_side_finds_the_other() -> None:
     of = bank()
     other = other_sides(of.names, of.parents)
-    assert torch.equal(other[other], torch.arange(len(of.names)))
+    assert np.array_equal(other[other], np.arange(len(of.names)))
     swapped = {of.names[j] for j in range(len(of.names)) if int(other[j]) != j}
     assert swapped and all("left" in n.lower() or "right" in n.lower() for n in swapped)
     with refused("sides-unknown"):

@@ -10,20 +10,20 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.plan import Guide
+from poise.recipes.imitation import Imitation
 
 N = 4
-MakeEnv = Callable[..., ImitationEnv]
+MakeTask = Callable[..., Imitation]
 
 
 @pytest.fixture
-def led(make_env: MakeEnv) -> ImitationEnv:
+def led(make_task: MakeTask) -> ImitationEnv:
     """Characters that a hand leads which no inverse dynamics tells anything."""
-    env = make_env(N, auto_reset=False, help_limit=5000.0)
-    nothing = torch.zeros(len(env.reference.qpos), 3)
-    assert env.task.residual is not None
-    guide = Guide(env.reference, env.task.residual, nothing, nothing)
-    env.controls._task = replace(env.task, guide=guide)
-    return env
+    task = make_task(help_limit=5000.0)
+    nothing = torch.zeros(len(task.reference.qpos), 3)
+    assert task.task.residual is not None
+    guide = Guide(task.reference, task.task.residual, nothing, nothing)
+    return replace(task, task=replace(task.task, guide=guide)).env(N, auto_reset=False, threads=1)
 
 
 def wrench(env: ImitationEnv, lift: float, scale: float = 1.0) -> torch.Tensor:

@@ -143,8 +143,8 @@ def test_its_shares_replace_those_of_a_filter(task: Imitation, tracker: Tracker,
     env, zero = alone(filtered(task, 0.6)), torch.zeros(1, dtype=torch.long)
     control = made(filtered(task, 0.6), tracker, nothing)
     # The first copy does what the policy does, and not what was asked of the others.
-    assert control._keep.flatten().tolist() == pytest.approx([0.6, share, share, share])
-    control._keep[0] = share
+    assert control.keep.flatten().tolist() == pytest.approx([0.6, share, share, share])
+    control.keep[0] = share
     obs = env.reset_to(zero, zero)
     control.watch(env)
     last = None

@@ -104,7 +104,7 @@ def test_all_headings_of_an_environment_are_those_of_the_hips() -> None:
     env.reset_to(HERE, HERE * 2)
     row = env.reference.rows(HERE, HERE * 2)
     seen = seen_by(env.task.style, env.view())
-    torch.testing.assert_close(env._clip_features(row), seen, atol=2e-4, rtol=1e-3)
+    torch.testing.assert_close(env.clip_features(row), seen, atol=2e-4, rtol=1e-3)
     env.close()
 
 

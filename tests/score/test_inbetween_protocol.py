@@ -17,9 +17,9 @@ from benchmarks.suites.inbetween_complete import Baseline
 from poise.formats import read_clip
 from poise.learn.transition import SkeletonLayout
 from poise.metrics import physics
-from poise.motion.windows import LAFAN1_FACING, pack_frames, without_still_root
 from poise.score.gaps import BANDAI, LAFAN1, Protocol, deviation, evaluate, slide, test_set
 from poise.score.gaps import TestSet as InbetweenTestSet
+from poise.synthesis.windows import LAFAN1_FACING, pack_frames, without_still_root
 
 # pytest would take the function for a test.
 make_test_set = test_set

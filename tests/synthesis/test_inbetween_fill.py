@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 
 from poise.formats.own import pack_clips, unpack_clips
 from poise.learn.between import Between
+from poise.learn.checkpoint import State, tensors_of
 from poise.learn.inbetween_model import Adaptation, InbetweenModel, load_model, make_net, save_model
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import quat_conj, quat_distance, quat_mul
@@ -29,6 +31,11 @@ def model(kind: str = "transformer", longest: int = 60) -> InbetweenModel:
         with torch.no_grad():
             net.encoder.leave.weight.normal_(0, 0.005, generator=torch.Generator().manual_seed(1))
     return InbetweenModel(kind, net.eval(), of.names, of.offsets[0].float(), 30.0, longest)
+
+
+def packed(clip: Clip) -> tuple[State, list[Any]]:
+    arrays, notes = pack_clips([clip])
+    return tensors_of(arrays), notes
 
 
 def between(a: np.ndarray, b: np.ndarray) -> torch.Tensor:
@@ -137,7 +144,7 @@ def other_human(clip: Clip, thumb: str = "LeftThumb") -> Clip:
 
 def test_another_skeleton_is_filled_on_the_models_and_brought_back() -> None:
     clip = other_human(swing(3.0, speed=0.6, bend=0.5))
-    knows = dataclasses.replace(model(), example=pack_clips([swing(2.0, speed=0.3)]))
+    knows = dataclasses.replace(model(), example=packed(swing(2.0, speed=0.3)))
     keys = (12, 40, 61)
     filled = fill_keyframes(clip, keys, knows, Filling(foot_lock=False))
     assert "brought back" in filled.warnings[0]
@@ -156,19 +163,19 @@ def test_another_skeleton_is_filled_on_the_models_and_brought_back() -> None:
 def test_on_the_models_own_skeleton_the_passage_changes_nothing() -> None:
     clip = swing(3.0, speed=0.6, bend=0.5)
     rig = OtherRig.between(other_human(clip), clip)
-    own = tuple(torch.tensor(x) for x in (other_human(clip).root_pos, other_human(clip).rot))
+    own = other_human(clip).arrays()
     there = rig.to_model(own)
     same = rig.changed(own, there)
-    assert torch.allclose(same[0], own[0], atol=1e-9)
-    assert torch.allclose((same[1] * own[1]).sum(-1).abs(), torch.ones(()).double(), atol=1e-9)
+    assert np.allclose(same[0], own[0], atol=1e-9)
+    assert np.allclose(np.abs((same[1] * own[1]).sum(-1)), 1.0, atol=1e-9)
     # The other human is the same one 1.2 times as large, so it comes to the model as the clip was.
-    on_model = clip.replaced(root_pos=there[0].numpy(), rot=there[1].numpy()).positions()
+    on_model = clip.replaced(root_pos=there[0], rot=there[1]).positions()
     shift = (on_model - clip.positions())[:1, :1]
     assert np.allclose(on_model - shift, clip.positions(), atol=0.02)
 
 
 def test_the_example_lies_in_the_models_file(tmp_path: Path) -> None:
-    knows = dataclasses.replace(model(), example=pack_clips([swing(1.0)]))
+    knows = dataclasses.replace(model(), example=packed(swing(1.0)))
     save_model(tmp_path / "model.safetensors", knows, half=True)
     again = load_model(tmp_path)
     assert again.example is not None

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-import torch
 
 from poise.jobs.inbetween.fill import inbetween
 from poise.kinematics.feet import off_floor
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul
+from poise.motion.vectors import norm
 from poise.synthesis.limits import calmed, excess, fastest, spread
 from toy_human import human, swing, turn
 
@@ -17,39 +18,39 @@ FPS = 30.0
 def test_what_is_missed_is_spread_over_the_whole_gap() -> None:
     """Frames that end 0.5 m and 0.6 rad off their keyframe reach it, and none of them jumps."""
     n = 29
-    t = torch.arange(1, n + 1, dtype=torch.float64)[:, None]
-    root = torch.cat((0.01 * t, 0 * t, 0 * t), 1)
+    t = np.arange(1, n + 1, dtype=float)[:, None]
+    root = np.concatenate((0.01 * t, 0 * t, 0 * t), 1)
     rot = turn("z", 0.01 * t[:, 0])[:, None]
     ends = (
-        torch.tensor([[0.0, 0, 0], [0.8, 0, 0]], dtype=torch.float64),
-        turn("z", torch.tensor([0.0, 0.9], dtype=torch.float64))[:, None],
+        np.array([[0.0, 0, 0], [0.8, 0, 0]], dtype=float),
+        turn("z", np.array([0.0, 0.9], dtype=float))[:, None],
     )
     got = spread(ends, (root, rot))
-    whole = torch.cat((ends[0][:1], got[0], ends[0][1:]))
-    step = whole.diff(dim=0).norm(dim=-1)
+    whole = np.concatenate((ends[0][:1], got[0], ends[0][1:]))
+    step = norm(np.diff(whole, axis=0))
     assert float(step.max()) < 1.6 * 0.8 / (n + 1) + 0.01
     assert float(step[-1]) < 0.015
-    turned = torch.cat((ends[1][:1], got[1], ends[1][1:]))[:, 0]
+    turned = np.concatenate((ends[1][:1], got[1], ends[1][1:]))[:, 0]
     angle = quat_angle(quat_mul(turned[1:], quat_conj(turned[:-1])))
     assert float(angle.max()) < 0.06 and float(angle[-1]) < 0.015
     # Frames that miss nothing stay.
-    right = (torch.tensor([[0.0, 0, 0], [0.3, 0, 0]], dtype=torch.float64), rot[[0, -1]].clone())
-    right[1][0], right[1][1] = turn("z", torch.tensor([0.0, 0.3], dtype=torch.float64))[:, None]
+    right = (np.array([[0.0, 0, 0], [0.3, 0, 0]], dtype=float), rot[[0, -1]].copy())
+    right[1][0], right[1][1] = turn("z", np.array([0.0, 0.3], dtype=float))[:, None]
     same = spread(right, (root, rot))
-    torch.testing.assert_close(same[0], root)
+    np.testing.assert_allclose(same[0], root, atol=1e-7)
     assert float(quat_angle(quat_mul(same[1], quat_conj(rot))).max()) < 1e-6
 
 
 def test_the_network_is_followed_as_far_as_people_reach() -> None:
-    plain = torch.zeros(4, 3), turn("x", torch.zeros(4))[:, None]
-    wild = torch.ones(4, 3), turn("x", torch.ones(4))[:, None]
+    plain = np.zeros((4, 3)), turn("x", np.zeros(4))[:, None]
+    wild = np.ones((4, 3)), turn("x", np.ones(4))[:, None]
 
-    def over(motion: tuple[torch.Tensor, torch.Tensor]) -> float:
+    def over(motion: tuple[np.ndarray, np.ndarray]) -> float:
         return float(motion[0].max()) / 0.6
 
     got = calmed(wild, plain, lambda m, feet: m, over)
     assert (got.share, got.feet) == (0.5, "held")
-    torch.testing.assert_close(got.motion[0], torch.full((4, 3), 0.5))
+    np.testing.assert_allclose(got.motion[0], np.full((4, 3), 0.5), atol=1e-7)
     # Where held feet are the fault, they are let go.
     got = calmed(wild, plain, lambda m, feet: (m[0] + 5.0 * (feet == "held"), m[1]), over)
     assert (got.share, got.feet) == (0.5, "free")
@@ -60,19 +61,19 @@ def test_the_network_is_followed_as_far_as_people_reach() -> None:
 
 def test_speeds_and_heights_of_a_skeleton() -> None:
     clip = swing(1.0)
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     limits = fastest(clip.skeleton)
     hands = [n for n in clip.skeleton.names if "Hand" in n]
     assert float(limits[clip.skeleton.names.index(hands[0])]) == 9.0
     assert excess(clip.skeleton, limits, (root, rot), clip.fps)[0] < 1.0
-    root = root.clone()
+    root = root.copy()
     root[10:, 0] += 0.5
     factor, joint = excess(clip.skeleton, limits, (root, rot), clip.fps)
     assert factor > 3.0 and limits[joint] < 5.0
-    up = root.clone()
+    up = root.copy()
     up[5, 2] += 0.4
     height = off_floor(clip.skeleton, (up, rot))
-    assert float(height[5]) > 0.3 and float(height[[0, 1, 2]].abs().max()) < 0.1
+    assert float(height[5]) > 0.3 and float(np.abs(height[[0, 1, 2]]).max()) < 0.1
 
 
 def test_keyframes_that_ask_for_too_much_are_named() -> None:

@@ -8,9 +8,9 @@ from test_inbetween_fill import model
 
 from poise.learn.between import Between
 from poise.learn.inbetween_model import make_net
-from poise.motion.windows import FrameBank
 from poise.synthesis.filler import ASIDE_M, TURNED, Detour, Filling, drawn, through
 from poise.synthesis.keyframes import fill_keyframes
+from poise.synthesis.windows import FrameBank
 from toy_human import swing
 from toy_windows import SMALL, bank, layout
 

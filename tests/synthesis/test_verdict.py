@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from test_inbetween_fill import model
 
 from poise.kinematics.repair.faults import KINDS
@@ -55,8 +54,8 @@ def test_a_gap_with_faults_is_filled_anew_and_one_without_is_not(
 
     def spoiled(
         self: Filler,
-        root: torch.Tensor,
-        rot: torch.Tensor,
+        root: np.ndarray,
+        rot: np.ndarray,
         gap: Gap,
         noise: object,
         most: float,

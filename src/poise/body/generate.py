@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 
 from poise.body import body_table as presets
 from poise.body.body_table import (
@@ -24,6 +23,7 @@ from poise.body.shapes import Ruler, geoms_of
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate
+from poise.motion.vectors import norm
 from poise.settings import Range, validate
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -152,11 +152,11 @@ def _link(
     chain = [joint]
     while skeleton.parents[chain[0]] >= 0 and skeleton.parents[chain[0]] not in kept:
         chain.insert(0, skeleton.parents[chain[0]])
-    pos, quat = torch.zeros(3, dtype=torch.float64), torch.tensor(_IDENTITY, dtype=torch.float64)
+    pos, quat = np.zeros(3), np.asarray(_IDENTITY, dtype=float)
     for j in chain:
-        pos = pos + quat_rotate(quat, torch.tensor(skeleton.offsets[j]))
-        quat = quat_mul(quat, torch.tensor(neutral[j]))
-    return skeleton.parents[chain[0]], pos.numpy(), quat.numpy()
+        pos = pos + quat_rotate(quat, skeleton.offsets[j])
+        quat = quat_mul(quat, neutral[j])
+    return skeleton.parents[chain[0]], pos, quat
 
 
 def _hinges(skeleton: Skeleton, part: Part, cmu: bool) -> tuple[str, tuple]:
@@ -199,9 +199,9 @@ def asf_axis_quat(axis: tuple[float, float, float], order: str, up_axis: str) ->
     The file states extrinsic turns in `order` (Rz Ry Rx for XYZ) in its own frame; the turn that
     carries its vertical to Z brings them over.
     """
-    q = euler_to_quat(torch.tensor([axis[::-1]], dtype=torch.float64), order[::-1])
-    turn = torch.tensor([_TO_Z_UP[up_axis]], dtype=torch.float64)
-    return quat_mul(turn / turn.norm(), q)[0].numpy()
+    q = euler_to_quat(np.array([axis[::-1]], dtype=float), order[::-1])
+    turn = np.array([_TO_Z_UP[up_axis]], dtype=float)
+    return quat_mul(turn / norm(turn), q)[0]
 
 
 def _ranges(skeleton: Skeleton, part: Part, order: str) -> tuple[tuple[float, float], ...]:

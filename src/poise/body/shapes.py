@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from poise.body import body_table as presets
 from poise.body.body_table import PARTS, Geom
@@ -92,7 +91,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _rot_inv(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return quat_rotate_inv(torch.tensor(q), torch.tensor(v)).numpy()
+    return quat_rotate_inv(q, v)
 
 
 def _neutral_frames(anatomy: Anatomy, links: Links) -> dict[int, np.ndarray]:
@@ -100,7 +99,7 @@ def _neutral_frames(anatomy: Anatomy, links: Links) -> dict[int, np.ndarray]:
     out = {anatomy.parts[0].joint: np.array([1.0, 0.0, 0.0, 0.0])}
     for part in anatomy.parts[1:]:
         anchor, _, quat = links[part.joint]
-        out[part.joint] = quat_mul(torch.tensor(out[anchor]), torch.tensor(quat)).numpy()
+        out[part.joint] = quat_mul(out[anchor], quat)
     return out
 
 
@@ -188,7 +187,7 @@ def _sole_box(sole: tuple[np.ndarray, np.ndarray, float, float], height: float) 
     down, forward, ankle, reach = sole
     heel, half_z = presets.HEEL_LENGTH * height, 0.010 * height
     x, z = forward, -down
-    axes = torch.tensor(np.stack((x, np.cross(z, x), z), 1))
+    axes = np.stack((x, np.cross(z, x), z), 1)
     centre = x * (reach - heel) / 2 - z * (ankle - half_z)
     size = ((reach + heel) / 2, presets.FOOT_WIDTH * height / 2, half_z)
     return Geom("box", size, tuple(centre), tuple(matrix_to_quat(axes).tolist()))

@@ -222,9 +222,30 @@ def failure(problem: BaseException) -> tuple[int, PoiseError]:
         return 1, PoiseError(
             "there is not enough memory; use fewer --envs or a shorter clip", code="out-of-memory"
         )
+    if isinstance(problem, ImportError) and (package := _absent(problem)):
+        return REFUSED, PoiseError(
+            f"this needs the package {package}, which is not installed",
+            hint=f"pip install {package}. Files are read, mended, converted and retargeted without it",
+            code="package-missing",
+        )
     said = f": {problem}" if str(problem) else ""
     hint = "This is a fault of Poise; set POISE_DEBUG=1 and run again for the traceback"
     return 1, PoiseError(f"unexpected {type(problem).__name__}{said}", hint=hint, code="internal-fault")
+
+
+#: What verbs that simulate or learn need, by the module's name.
+_HEAVY = {
+    "torch": "torch",
+    "mujoco": "mujoco",
+    "gymnasium": "gymnasium",
+    "safetensors": "safetensors",
+    "tensorboard": "tensorboard",
+}
+
+
+def _absent(problem: ImportError) -> str | None:
+    """The package that an import did not find, if it is one of those that files need not."""
+    return _HEAVY.get((problem.name or "").partition(".")[0])
 
 
 def of_path(problem: OSError) -> PoiseError:

@@ -401,11 +401,9 @@ def _detail(clip: Clip, healed: Clip) -> dict[str, float]:
     """How much of the movement is left by frequency; empty where nothing was changed, or frames were."""
     if clip is healed or clip.frames != healed.frames:
         return {}
-    import torch
-
     from poise.metrics import detail
 
-    return detail(torch.tensor(healed.positions()), torch.tensor(clip.positions()), clip.fps)
+    return detail(healed.positions(), clip.positions(), clip.fps)
 
 
 def _written(clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:

@@ -40,8 +40,8 @@ VERBS = {
     "play": "simulate a trained run from one frame and write a page to watch",
     "doctor": "what is wrong with a motion, and mend it; without a clip: is this machine ready",
 }
-#: Verbs that only read and write motions.
-_LIGHT = ("info", "convert")
+#: Verbs that only read, mend and write motions: they need neither torch nor MuJoCo.
+_LIGHT = ("info", "convert", "retarget", "doctor")
 _FIRST = (
     ("poise demo", "two minutes, no clip of yours; then open demo/report.html"),
     ("poise info walk.bvh", "what the clip holds"),
@@ -133,9 +133,9 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         inputs += inputs_of(options)
         # What is imported now takes seconds.
         tell(_begins(verb, inputs), "dim")
-    if verb != "open":
-        # Its jobs have processes of their own.
-        share_cores(verb not in _LIGHT)
+    if verb not in (*_LIGHT, "open"):
+        # The jobs of the page have processes of their own.
+        share_cores()
     with named_options(known, rest):
         answer = module.run(**options) if isinstance(options, dict) else module.run(options, rest)
     notes([n for n in answer.notes if n not in answer.said])
@@ -161,22 +161,13 @@ def _begins(verb: str, inputs: Sequence[Path]) -> str:
     return f"{doing} {', '.join(map(str, inputs[:3]))}{more}"
 
 
-def share_cores(physics: bool) -> None:
-    """One thread for torch, since the physics uses the cores; OMP_NUM_THREADS overrules it. physics:
-    whether the verb needs MuJoCo, which takes time to load."""
-    try:
-        import torch
-    except ImportError:
-        # Only `doctor` runs without them, and it says what to do.
-        return
+def share_cores() -> None:
+    """One thread for torch, since the physics uses the cores; OMP_NUM_THREADS overrules it."""
+    import mujoco
+    import torch
+
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
-    if not physics:
-        return
-    try:
-        import mujoco
-    except ImportError:
-        return
     # The guard reports instabilities; MuJoCo's own log would litter the user's folder.
     mujoco.set_mju_user_warning(lambda _: None)
 

@@ -174,7 +174,7 @@ def _answered(made: Any) -> None:
     """Writes what was made, or why it was not, as JSON."""
     from poise.cli.main import share_cores
 
-    share_cores(True)
+    share_cores()
     try:
         answer: dict[str, Any] = {"ok": True, **made()}
     except (KeyboardInterrupt, Exception) as problem:

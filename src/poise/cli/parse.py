@@ -49,7 +49,7 @@ def parse(options: Callable[..., T], argv: Sequence[str], prog: str, default: An
 
     try:
         does = about(options)
-        with _told(refuse), _whole_lines(does), contextlib.redirect_stderr(io.StringIO()):
+        with _told(refuse), whole_lines(does), contextlib.redirect_stderr(io.StringIO()):
             how: dict[str, Any] = {"prog": prog, "config": _CONFIG, "default": default}
             if default is None:
                 how.pop("default")
@@ -101,7 +101,7 @@ def _told(refuse: Any) -> contextlib.AbstractContextManager[None]:
 
 
 @contextlib.contextmanager
-def _whole_lines(kept: str) -> Iterator[None]:
+def whole_lines(kept: str) -> Iterator[None]:
     """Has tyro wrap help at the window's width alone: it breaks docstrings where their source does.
     kept: a text with lines of its own."""
     # Private to tyro: without it help is as tyro wraps it.

@@ -11,9 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rich.progress import BarColumn, Progress, TextColumn
-from rich.text import Text
-
 from poise.cli.console import INTERRUPTED, Answer, err, launched, notes, say, tell
 from poise.cli.options import Reading, Training
 from poise.errors import PoiseError
@@ -88,6 +85,8 @@ def showing(title: str, at_once: bool = True) -> Iterator[Callable[[float, str],
 
         yield line
         return
+    from rich.progress import BarColumn, Progress, TextColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=1.0, what="")
@@ -109,6 +108,8 @@ def working(what: str) -> Iterator[None]:
         tell(what, "dim")
         yield
         return
+    from rich.text import Text
+
     with console.status(Text(what)):
         yield
 

@@ -412,9 +412,9 @@ class ImitationEnv:
                 ids = self._restart(outcome.ids)
                 # All others see what `judge` has made of them already.
                 obs = self._obs.copy_(final)
-                obs[ids] = self._terms.observe(self._sources.of(self._told(ids), ids))
+                obs[ids] = self._observe(ids)
         if self._watched():
-            obs = self._observe()
+            obs = self._observe().clone()
             final = final if self.task.auto_reset else obs
         return step._replace(obs=obs, final_obs=final)
 
@@ -438,10 +438,17 @@ class ImitationEnv:
 
     # --- views --------------------------------------------------------------------------------
 
-    def observe(self) -> Tensor:
-        """Observations `(N, O)` of the worlds as they stand, after the goal has looked at them."""
+    def observe(self, ids: Tensor | None = None) -> Tensor:
+        """Observations `(n, O)` of worlds `ids (n,)`, all for None, as they stand, after the goal has
+        looked at them."""
         self._watched()
-        return self._observe()
+        return self._observe(ids).clone()
+
+    @property
+    def recorded(self) -> frozenset[str]:
+        """What is replayed from a recording by now: "observe", the observations of worlds that begin
+        anew, and "judge", all terms after a step. Terms that look at values, see `record`, never are."""
+        return self._terms.recorded
 
     def record_at_once(self) -> None:
         """Terms are recorded now, for real time: else a later step takes the time of fifty."""
@@ -479,8 +486,8 @@ class ImitationEnv:
         now, ahead = known or (goal.now(ids), goal.ahead(1, ids))
         return {"goal": now, "ahead": ahead} | ({"window": goal.window(steps, ids)} if steps else {})
 
-    def _observe(self) -> Tensor:
-        return self._terms.observe(self._sources.of(self._told())).clone()
+    def _observe(self, ids: Tensor | None = None) -> Tensor:
+        return self._terms.observe(self._sources.of(self._told(ids), ids))
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -508,17 +515,18 @@ class ImitationEnv:
     def past(self, rows: Tensor, count: int) -> Tensor | None:
         """`(n, count, F)` of the clips up to the starts of the new episodes in `rows (n,)`; NaN where a
         clip begins later, None if all do."""
-        past = self._clip_features.past(self.clip[rows], self.frame[rows], count)
+        past = self.clip_features.past(self.clip[rows], self.frame[rows], count)
         if past is not None and self.recovery is not None:
             past[self.recovery.past(rows)] = torch.nan
         return past
 
     def demos(self, frames: int) -> ClipWindows:
         """Draws windows of so many frames of the clips, by the odds with which episodes draw clips."""
-        return ClipWindows(self._clip_features, frames, lambda: self.weights)
+        return ClipWindows(self.clip_features, frames, lambda: self.weights)
 
     @cached_property
-    def _clip_features(self) -> ClipFeatures:
+    def clip_features(self) -> ClipFeatures:
+        """What a motion prior sees of the clips' frames."""
         return ClipFeatures(self.reference, self._terms.style, left=self._left)
 
     # --- copies and persistence ---------------------------------------------------------------

@@ -30,7 +30,12 @@ class Recorded:
     """
 
     def __init__(self, plain: TensorFunction):
-        self._function, self._left = plain, OFTEN
+        self._plain, self._function, self._left = plain, plain, OFTEN
+
+    @property
+    def replays(self) -> bool:
+        """Whether it is replayed from a recording by now."""
+        return self._function is not self._plain
 
     def __call__(self, *given: Tensor) -> tuple[Tensor, ...]:
         self._left -= 1
@@ -53,7 +58,8 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
         try:
             graph = _traced(plain, given)
             _drop_whole_slices(graph)
-            recorded = torch._C._create_function_from_graph("replayed", graph)
+            # Torch has no public name for it; one that is renamed is the fallback below.
+            recorded = torch._C._create_function_from_graph("replayed", graph)  # noqa: SLF001
         except (RuntimeError, AttributeError, TypeError):
             return plain
     # What a recording would freeze, such as a value that was asked for, torch only warns of.
@@ -75,7 +81,9 @@ def _traced(plain: TensorFunction, given: tuple[Tensor, ...]) -> Any:
     which is some MB for every environment.
     """
     names = [f"given{k}" for k in range(len(given))]
-    return torch._C._create_graph_by_tracing(plain, given, lambda _: "", True, False, None, names)[0]
+    # Torch has no public name for it; one that is renamed is the fallback of `record`.
+    trace = torch._C._create_graph_by_tracing  # noqa: SLF001
+    return trace(plain, given, lambda _: "", True, False, None, names)[0]
 
 
 def _drop_whole_slices(graph: Any) -> None:
@@ -193,6 +201,7 @@ class Terms:
             torch.tensor(counts, dtype=torch.bool).reshape(-1, 2, 1).to(device).unbind(1)
         )
         self._recorded: dict[str, TensorFunction] = {}
+        self._plain: dict[str, TensorFunction] = {}
         self._at_once = False
         self._pool: ThreadPoolExecutor | None = None
 
@@ -200,6 +209,16 @@ class Terms:
         """They are recorded when they are next evaluated, seldom or not."""
         self._at_once = True
         self._recorded.clear()
+
+    @property
+    def recorded(self) -> frozenset[str]:
+        """Which of "observe" and "judge" are replayed from a recording by now, see `record`."""
+        known = self._recorded.items()
+        return frozenset(
+            name
+            for name, f in known
+            if (f.replays if isinstance(f, Recorded) else f is not self._plain[name])
+        )
 
     def frame(self, sources: Mapping[str, Tensor]) -> Frame:
         """What the terms see."""
@@ -302,5 +321,6 @@ class Terms:
             # Many worlds are trained, and two threads need a recording. A program that is called as
             # seldom as when a motion is tried once is sooner done without: both do the same to the bit.
             now = self._at_once or OFTEN == 1 or 2 * len(sources["age"]) >= MANY
+            self._plain[name] = flat
             self._recorded[name] = record(flat, given) if now else Recorded(flat)
         return self._recorded[name](*sources.values())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -15,7 +16,7 @@ from torch import Tensor
 from poise.body import Humanoid, make_spec
 from poise.env.bins import MotionBins
 from poise.env.evaluate import Recorded
-from poise.env.frame import FIELDS, Pose, PoseLayout
+from poise.env.frame import FIELDS, Pose, PoseLayout, PosePlace
 from poise.errors import PoiseError
 from poise.kinematics import Kinematics, cycle_step, cycle_velocity, qpos_velocity
 from poise.motion.rotations import heading_quat, quat_mul, quat_rotate
@@ -33,7 +34,7 @@ class Poser:
     def __init__(self, humanoid: Humanoid, device: torch.device | str = "cpu"):
         self.humanoid = humanoid
         self.kinematics = Kinematics(humanoid.table)
-        self._fast = Kinematics(humanoid.table, torch.float32, device)
+        self._fast = Kinematics(humanoid.table, "float32")
         self._made: dict[int, tuple[Any, ...]] = {}
         self._turned = Recorded(self._turns)
 
@@ -140,11 +141,52 @@ def _centre_of_mass(humanoid: Humanoid, pos: Tensor, quat: Tensor) -> Tensor:
     return ((centre * mass[:, None]).sum(-2) / mass.sum()).float()
 
 
-# What references have one of for each clip or each frame.
+# Tensors that references have one row of for each clip or each frame.
 _JOINED = (
-    "qpos", "qvel", "hinges", "length", "cyclic", "min_height", "cycle_turn", "cycle_travel", "body",
-    "_place", "_packed",
-)  # fmt: skip
+    *("qpos", "qvel", "hinges", "length", "cyclic", "min_height"),
+    *("cycle_turn", "cycle_travel", "body"),
+)
+# The last columns of packed poses, which say of what clip they are.
+_PLACE = slice(-len(PosePlace._fields), None)
+
+
+@dataclass(frozen=True, eq=False)
+class GoalRows:
+    """The frames of a reference as goals: R rows of packed poses, see `PoseLayout`.
+
+    Attributes:
+        judged: `(R, W)` float32, by which characters are judged.
+        told: `(R, W)` float32, what policies are told: `judged` itself, or something else.
+        after: `(R,)`, the row that follows each row.
+    """
+
+    judged: Tensor
+    told: Tensor
+    after: Tensor
+
+    @property
+    def misleads(self) -> bool:
+        """Whether policies are told something else than what characters are judged by."""
+        return self.told is not self.judged
+
+    @property
+    def place(self) -> Tensor:
+        """`(R, 4)` what the rows say of their clips, as a view."""
+        return self.judged[:, _PLACE]
+
+    def to(self, device: torch.device) -> GoalRows:
+        """The same rows on `device`."""
+        judged = self.judged.to(device)
+        return GoalRows(judged, self.told.to(device) if self.misleads else judged, self.after.to(device))
+
+    @classmethod
+    def joined(cls, parts: Sequence[GoalRows]) -> GoalRows:
+        """The rows of all parts, one part after another."""
+        judged = torch.cat([p.judged for p in parts])
+        told = torch.cat([p.told for p in parts]) if any(p.misleads for p in parts) else judged
+        first = torch.tensor([0, *(len(p.judged) for p in parts)]).cumsum(0).tolist()
+        after = torch.cat([p.after + row for p, row in zip(parts, first, strict=False)])
+        return cls(judged, told, after)
 
 
 class Reference:
@@ -211,19 +253,16 @@ class Reference:
         frame = torch.arange(len(qpos)) - self.start[clip]
         end = (frame == self.length[clip] - 1) & ~self.cyclic[clip]
         told = self.phase(clip, frame), self.min_height[clip], end.float(), self.body[clip].float()
-        self._place = torch.stack(told, 1)
-        #: The row that follows each row.
-        self._after = self.rows(clip, frame + 1)
         pose = self._poses(qpos, qvel, self.body[clip])
         #: Where the numbers of packed poses stand.
         self.layout = PoseLayout(pose)
-        self._packed = self.layout.pack(pose, self._place)
-        #: The same of what policies are told, where that is something else, see `told`.
-        self._told: Tensor | None = None
+        packed = self.layout.pack(pose, torch.stack(told, 1))
+        #: The frames as goals.
+        self.goal_rows = GoalRows(packed, packed, self.rows(clip, frame + 1))
         # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
         steps = [cycle_step(q) for q in motions]
-        self.cycle_turn = torch.stack([turn for turn, _ in steps])
-        self.cycle_travel = torch.stack([travel for _, travel in steps])
+        self.cycle_turn = torch.from_numpy(np.stack([turn for turn, _ in steps]))
+        self.cycle_travel = torch.from_numpy(np.stack([travel for _, travel in steps]))
 
     def to(self, device: torch.device) -> Reference:
         """The same motions with what environments read on `device`; `kinematics` stays on the CPU."""
@@ -233,7 +272,7 @@ class Reference:
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 setattr(there, name, value.to(device))
-        there.bins = self.bins.to(device)
+        there.bins, there.goal_rows = self.bins.to(device), self.goal_rows.to(device)
         there.poser = Poser(self.humanoid, device)
         return there
 
@@ -242,13 +281,10 @@ class Reference:
         parts, out = (self, *others), copy.copy(self)
         for name in _JOINED:
             setattr(out, name, torch.cat([getattr(p, name) for p in parts]))
-        if any(p.misleads for p in parts):
-            out._told = torch.cat([p._packed if p._told is None else p._told for p in parts])
+        out.goal_rows = GoalRows.joined([p.goal_rows for p in parts])
         out.names = tuple(name for p in parts for name in p.names)
         out.start = torch.cumsum(out.length, 0) - out.length
         out.any_cyclic = any(p.any_cyclic for p in parts)
-        rows = torch.tensor([0, *(len(p.qpos) for p in parts)]).cumsum(0).tolist()
-        out._after = torch.cat([p._after + row for p, row in zip(parts, rows, strict=False)])
         cut = MotionBins.cut(out.length.cpu(), out.cyclic.cpu(), self.rate_hz)
         out.bins = cut.to(self.qpos.device)
         return out
@@ -294,12 +330,12 @@ class Reference:
     @property
     def pose(self) -> Pose:
         """Every frame of every clip, as it stands in the clip."""
-        return self.layout.unpacked(self._packed)
+        return self.layout.unpacked(self.goal_rows.judged)
 
     def with_pose(self, pose: Pose) -> Reference:
         """The same clips with other goals: every frame's pose, of the same shapes as `pose` has."""
-        other = copy.copy(self)
-        other._packed, other._told = self.layout.pack(pose, self._place), None
+        other, packed = copy.copy(self), self.layout.pack(pose, self.goal_rows.place)
+        other.goal_rows = replace(self.goal_rows, judged=packed, told=packed)
         return other
 
     def told(self, motions: Sequence[np.ndarray]) -> Reference:
@@ -324,13 +360,14 @@ class Reference:
         qpos, qvel = (torch.tensor(np.concatenate(x), dtype=torch.float64) for x in (motions, moves))
         other = copy.copy(self)
         pose = self._poses(qpos, qvel, self.body.repeat_interleave(self.length))
-        other._told, other.hinges = self.layout.pack(pose, self._place), qpos[:, 7:].contiguous()
+        told = self.layout.pack(pose, self.goal_rows.place)
+        other.goal_rows, other.hinges = replace(self.goal_rows, told=told), qpos[:, 7:].contiguous()
         return other
 
     @property
     def misleads(self) -> bool:
         """Whether policies are told something else than what characters are judged by."""
-        return self._told is not None
+        return self.goal_rows.misleads
 
     def gather(self, clip: Tensor, frame: Tensor) -> Pose:
         """The reference pose of `frame (N)` of `clip (N)`; cyclic clips are carried on."""
@@ -343,17 +380,17 @@ class Reference:
 
         rows: what `self.rows(clip, frame)` gives, where it is known already. told: as policies are told.
         """
-        table = self._packed if self._told is None or not told else self._told
+        table = self.goal_rows.told if told else self.goal_rows.judged
         packed = table.index_select(0, self.rows(clip, frame) if rows is None else rows)
         carry = self.carry(clip, frame)
         if carry is None:
             return packed
         pose = _carried(self.layout.unpacked(packed), carry[0].float(), carry[1].float())
-        return self.layout.pack(pose, packed[:, -self._place.shape[1] :])
+        return self.layout.pack(pose, packed[:, _PLACE])
 
     def packed(self, rows: Tensor) -> Tensor:
         """Packed poses of `rows (N)` as they stand in their clips."""
-        return self._packed.index_select(0, rows)
+        return self.goal_rows.judged.index_select(0, rows)
 
     def follow(
         self, rows: Tensor, clip: Tensor, frame: Tensor, held: Tensor | None = None
@@ -363,10 +400,10 @@ class Reference:
 
         held: `(N)` bool, where the rows stay and are frame `frame`.
         """
-        after = self._after.index_select(0, rows)
+        after = self.goal_rows.after.index_select(0, rows)
         rows = after if held is None else torch.where(held, rows, after)
         if not self.any_cyclic:
-            return rows, (self._packed if self._told is None else self._told).index_select(0, rows)
+            return rows, self.goal_rows.told.index_select(0, rows)
         ahead = frame + 1 if held is None else frame + 1 - held.long()
         return rows, self.gather_packed(clip, ahead, rows, told=True)
 

@@ -41,6 +41,11 @@ class ClipFeatures:
         self.left = left
         self._all: Tensor | None = None
 
+    @property
+    def kept(self) -> bool:
+        """Whether the features of all frames are kept by now."""
+        return self._all is not None
+
     def __call__(self, rows: Tensor) -> Tensor:
         """`(n, F)` float32 of the reference's `rows (n,)`."""
         if self._all is None and self._fits():

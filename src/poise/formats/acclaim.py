@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError, did_you_mean
 from poise.formats.guess import check_radians, few_degrees_note
@@ -297,9 +296,9 @@ def _hierarchy(asf: AsfFile, lines: list[_Line]) -> None:
             )
 
 
-def fixed_axes_quat(angles: np.ndarray, order: str) -> torch.Tensor:
+def fixed_axes_quat(angles: np.ndarray, order: str) -> np.ndarray:
     """Turns about fixed axes in the given order, first letter first: "XYZ" is Rz Ry Rx."""
-    return euler_to_quat(torch.tensor(angles[..., ::-1].copy()), order[::-1])
+    return euler_to_quat(angles[..., ::-1].copy(), order[::-1])
 
 
 RATES = (120.0, 60.0)
@@ -359,7 +358,7 @@ def read_amc(path: Path, options: ReadOptions) -> Clip:
         turns = [i for i, c in enumerate(columns) if c in ROTATIONS]
         if turns:
             order = "".join(columns[i][1].upper() for i in turns)
-            rot[:, j] = _local(asf, name, frames[name][:, turns] * scale, order).numpy()
+            rot[:, j] = _local(asf, name, frames[name][:, turns] * scale, order)
     root_pos = np.tile(np.array(asf.position), (count, 1))
     for i, c in enumerate(asf.order):
         if c in TRAVEL:
@@ -389,13 +388,13 @@ def read_asf(path: Path) -> Clip:
     return assemble(_raw(asf, path, names, root_pos, rot, []), UNSTATED)
 
 
-def _local(asf: AsfFile, name: str, angles: np.ndarray, order: str) -> torch.Tensor:
+def _local(asf: AsfFile, name: str, angles: np.ndarray, order: str) -> np.ndarray:
     """Local rotations `(T, 4)` in world-aligned rest frames: C R(dof) C^-1, C the bone's axes."""
     bone = asf.bones[name]
     by_axis = np.array([bone.axis["XYZ".index(c)] for c in bone.axis_order])
     c = fixed_axes_quat(by_axis, bone.axis_order)
     r = fixed_axes_quat(angles, order)
-    c = c.expand(len(r), 4)
+    c = np.broadcast_to(c, (len(r), 4))
     return quat_mul(quat_mul(c, r), quat_conj(c))
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.bvh_file import POSITIONS, BvhFile, parse_bvh
@@ -93,10 +92,10 @@ def _rotations(file: BvhFile) -> np.ndarray:
         if turns:
             groups.setdefault("".join(t[0] for t in turns), []).append((j, [t[1] for t in turns]))
     for order, members in groups.items():
-        columns = torch.tensor([c for _, c in members])
+        columns = np.array([c for _, c in members])
         for at in range(0, len(out), BLOCK):
-            radians = torch.tensor(np.radians(file.values[at : at + BLOCK]))
-            turned = euler_to_quat(radians[:, columns], order).numpy()
+            radians = np.radians(file.values[at : at + BLOCK])
+            turned = euler_to_quat(radians[:, columns], order)
             out[at : at + BLOCK, [j for j, _ in members]] = turned
     return out
 
@@ -181,20 +180,20 @@ def _from_world(
     tolerance: float,
 ) -> list[int]:
     """Joints with channels that are world positions; `moves` gets them in the parent's frame."""
-    pos, quat = [torch.tensor(root_pos)], [torch.tensor(rot[:, 0])]
+    pos, quat = [root_pos], [rot[:, 0]]
     found: list[int] = []
     for j, up in enumerate(parents):
         if up < 0:
             continue
         places = moves.get(j)
-        local = torch.tensor(np.tile(offsets[j], (len(rot), 1)) if places is None else places)
+        local = np.tile(offsets[j], (len(rot), 1)) if places is None else places
         if places is not None and _stray(places) > tolerance:
-            inside = quat_rotate_inv(quat[up], torch.tensor(places) - pos[up])
-            if _stray(inside.numpy()) < 0.5 * _stray(places):
+            inside = quat_rotate_inv(quat[up], places - pos[up])
+            if _stray(inside) < 0.5 * _stray(places):
                 found.append(j)
-                moves[j], local = inside.numpy(), inside
+                moves[j], local = inside, inside
         pos.append(pos[up] + quat_rotate(quat[up], local))
-        quat.append(quat_mul(quat[up], torch.tensor(rot[:, j])))
+        quat.append(quat_mul(quat[up], rot[:, j]))
     return found
 
 
@@ -275,8 +274,8 @@ def _channels(
         names = channel.order
         turns = "".join(c[0] for c in names if c.endswith("rotation"))
         if len(turns) < 3:
-            made = euler_to_quat(_angles_write(rot[:, j], turns), turns).expand(len(rot), 4)
-            lost = quat_angle(quat_mul(quat_conj(made), torch.tensor(rot[:, j]))).max()
+            made = np.broadcast_to(euler_to_quat(_angles_write(rot[:, j], turns), turns), (len(rot), 4))
+            lost = quat_angle(quat_mul(quat_conj(made), rot[:, j])).max()
             if lost > _LOST_ANGLE:
                 names = tuple(c for c in names if c in POSITIONS) + full
         if j == 0 and moving and not any(c in POSITIONS for c in names):
@@ -285,11 +284,11 @@ def _channels(
     return out
 
 
-def _angles_write(rot: np.ndarray, turns: str) -> torch.Tensor:
+def _angles_write(rot: np.ndarray, turns: str) -> np.ndarray:
     """`(T, len(turns))` rad: Euler angles about the given axes, the others dropped, continuous."""
     order = turns + "".join(c for c in "XYZ" if c not in turns)
-    angles = quat_to_euler(torch.tensor(rot), order)[:, : len(turns)].numpy()
-    return torch.tensor(np.unwrap(angles, axis=0))
+    angles = quat_to_euler(rot, order)[:, : len(turns)]
+    return np.unwrap(angles, axis=0)
 
 
 def _places(
@@ -301,11 +300,10 @@ def _places(
 ) -> tuple[dict[int, np.ndarray], np.ndarray]:
     """`(T, 3)` position channels of the root, of the joint that carries the travel, and of joints
     with channels that hold world positions; and `(J, 3)` offsets of the others."""
-    parents, turns, bones = skeleton.parents, torch.tensor(rot), torch.tensor(offsets)
     back = restored(skeleton, offsets, root_pos, rot) if kept else Restored({0: root_pos}, offsets)
     world = kept.get("world_positions", np.zeros(0)).astype(int)
-    pos, _ = forward_kinematics(parents, bones, torch.tensor(root_pos), turns)
-    return {int(j): pos[:, int(j)].numpy() for j in world} | back.paths, back.offsets
+    pos, _ = forward_kinematics(skeleton.parents, offsets, root_pos, rot)
+    return {int(j): pos[:, int(j)] for j in world} | back.paths, back.offsets
 
 
 def _hierarchy(
@@ -360,9 +358,7 @@ def _rows(
     for j in written:
         names = channels[j]
         turns = "".join(c[0] for c in names if c.endswith("rotation"))
-        angles = (
-            np.degrees(_angles_write(rot[:, j], turns).numpy()) if turns else np.zeros((len(rot), 0))
-        )
+        angles = np.degrees(_angles_write(rot[:, j], turns)) if turns else np.zeros((len(rot), 0))
         for name in names:
             if name in POSITIONS:
                 i = POSITIONS.index(name)

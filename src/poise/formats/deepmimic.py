@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.guess import check_radians
@@ -154,8 +153,8 @@ def _rotations(
         elif size == 1:
             hint = "Convert the angles to radians"
             check_radians({name: table[:, column]}, "DeepMimic's files hold", path, hint)
-            axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-            out[:, j] = axis_angle_to_quat(axis, torch.tensor(table[:, column])).numpy()
+            axis = np.array([0.0, 0.0, 1.0], dtype=float)
+            out[:, j] = axis_angle_to_quat(axis, table[:, column])
         column += size
     if worst[0] > _NORM_NOTE:
         notes.append(

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.gltf_file import GltfFile, index_of, read_accessor
@@ -203,7 +202,7 @@ class AnimationTrack:
             return self._hermite(i, u[:, None], span[:, None], turn)
         a, b = self.values[i], self.values[i + 1]
         if turn:
-            return slerp(torch.tensor(a), torch.tensor(b), torch.tensor(u)).numpy()
+            return slerp(a, b, u)
         return a + u[:, None] * (b - a)
 
     def _hermite(self, i: np.ndarray, u: np.ndarray, span: np.ndarray, turn: bool) -> np.ndarray:
@@ -213,7 +212,7 @@ class AnimationTrack:
         u2, u3 = u * u, u * u * u
         out = (2 * u3 - 3 * u2 + 1) * v0 + span * (u3 - 2 * u2 + u) * b0
         out = out + (3 * u2 - 2 * u3) * v1 + span * (u3 - u2) * a1
-        return normalize(torch.tensor(out)).numpy() if turn else out
+        return normalize(out) if turn else out
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.formats.figure import SceneBox, bone_figure, box_mesh
 from poise.formats.gltf_file import BIN_CHUNK, JSON_CHUNK, MAGIC
@@ -83,17 +82,17 @@ def _plan(clip: Clip) -> _Plan:
     kept = _kept(clip)
     unit, axis = (source.unit_m, source.up_axis) if kept else (1.0, "Y")
     count = len(skeleton)
-    rot = torch.tensor(quats_from_z_up(clip.rot, axis))
+    rot = quats_from_z_up(clip.rot, axis)
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
     offsets = vectors_from_z_up(skeleton.offsets, axis) / unit
     above = [(n, np.array(p), np.array(q), np.array(s)) for n, p, q, s in kept.get("above", [])]
     scale = np.array(kept.get("scale", np.ones(count)))
     base = base_of([(p, q, s) for _, p, q, s in above])
     own = Restored({0: root_pos}, offsets)
-    back = restored(skeleton, offsets, root_pos, rot.numpy()) if kept else own
+    back = restored(skeleton, offsets, root_pos, rot) if kept else own
     paths, offsets = back.paths, back.offsets
     paths[0] = base.down(paths[0])
-    rot[:, 0] = quat_mul(quat_conj(torch.tensor(base.turn)).expand(len(rot), 4), rot[:, 0])
+    rot[:, 0] = quat_mul(np.broadcast_to(quat_conj(base.turn), (len(rot), 4)), rot[:, 0])
     factor = np.full(count, base.below())
     for j, parent in enumerate(skeleton.parents):
         if parent >= 0:
@@ -109,7 +108,7 @@ def _plan(clip: Clip) -> _Plan:
         scale,
         place,
         np.array(kept.get("rest", [_IDENTITY] * count)),
-        unwrap_quats(normalize(rot)).numpy(),
+        unwrap_quats(normalize(rot)),
         paths,
         unit,
         axis,
@@ -214,7 +213,7 @@ def _rest_matrices(clip: Clip, plan: _Plan) -> np.ndarray:
 
     def matrix(place: np.ndarray, turn: np.ndarray, scale: np.ndarray) -> np.ndarray:
         out = np.eye(4)
-        out[:3, :3] = quat_to_matrix(torch.tensor(turn)).numpy() * scale
+        out[:3, :3] = quat_to_matrix(turn) * scale
         out[:3, 3] = place
         return out
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.text import listed
@@ -136,9 +135,9 @@ def inserted_rest_frames(rot: np.ndarray) -> tuple[int, str]:
     """
     if len(rot) < 4:
         return 0, ""
-    q = torch.tensor(rot[:40], dtype=torch.float64)
-    steps = quat_angle(quat_mul(quat_conj(q[:-1]), q[1:])).numpy()
-    from_rest = quat_angle(q[0]).numpy()
+    q = np.asarray(rot[:40], dtype=float)
+    steps = quat_angle(quat_mul(quat_conj(q[:-1]), q[1:]))
+    from_rest = quat_angle(q[0])
     if from_rest[0] > np.radians(0.5) or from_rest.mean() > _REST_ANGLE:
         return 0, ""
     root, joints = steps[:, 0], steps[:, 1:].mean(-1) if steps.shape[1] > 1 else steps[:, 0]

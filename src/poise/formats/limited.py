@@ -24,8 +24,8 @@ SECONDS, SECONDS_EACH = 20.0, 2e-6
 #: A busy machine may need so many times longer.
 _PATIENCE = 8.0
 _SCRIPT = Path(__file__).with_name("apart.py")
-#: Libraries that work in threads reserve memory for each of them.
-_ONE_THREAD = dict.fromkeys(
+#: What is set in that process: libraries that work in threads reserve memory for each of them.
+ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1"
 )
 
@@ -57,7 +57,7 @@ def read_limited(
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            timeout=_PATIENCE * seconds, check=False, env={**os.environ, **_ONE_THREAD},
+            timeout=_PATIENCE * seconds, check=False, env={**os.environ, **ONE_THREAD},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise slow from None

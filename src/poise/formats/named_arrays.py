@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.arrays import (
@@ -162,7 +161,7 @@ def read_kimodo(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Cl
         offsets=offsets,
         ends=(),
         root_pos=pos[:, 0],
-        rot=matrix_to_quat(torch.tensor(local)).numpy(),
+        rot=matrix_to_quat(local),
         fps=options.fps or _FPS,
         channels=(Channel(order=("axis-angle",)),) * count,
         unit_m=1.0,
@@ -259,13 +258,13 @@ def _local(
             f"{path}, frame {frame}",
             code="not-a-rotation",
         )
-    quat = torch.tensor(np.roll(xyzw, 1, axis=-1))
+    quat = np.roll(xyzw, 1, axis=-1)
     if is_local:
-        return quat.numpy()
+        return quat
     above = quat[:, [max(p, 0) for p in parents]]
     local = quat_mul(quat_conj(above), quat)
     local[:, 0] = quat[:, 0]
-    return local.numpy()
+    return local
 
 
 @dataclass(frozen=True)

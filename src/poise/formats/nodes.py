@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.guess import guess_unit, guess_up
@@ -14,8 +13,14 @@ from poise.formats.raw import ReadOptions, vectors_from_z_up
 from poise.formats.root_joint import Carried, carried, size_of
 from poise.formats.text import REST_POSE, shown
 from poise.motion.clip_info import body_height, sampled
-from poise.motion.rotations import matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
-from poise.motion.skeleton import Skeleton, posed
+from poise.motion.rotations import (
+    forward_kinematics,
+    matrix_to_quat,
+    quat_mul,
+    quat_rotate,
+    quat_rotate_inv,
+)
+from poise.motion.skeleton import Skeleton
 
 _HUMAN_M = (0.3, 4.0)
 _SHEAR = 1e-3
@@ -34,8 +39,8 @@ class Base:
 
     def down(self, pos: np.ndarray) -> np.ndarray:
         """World places `(T, 3)` in the frame of the node above the root."""
-        q = torch.tensor(self.turn).expand(len(pos), 4)
-        return quat_rotate_inv(q, torch.tensor(pos - self.place)).numpy() / (self.factor * self.scale)
+        q = np.broadcast_to(self.turn, (len(pos), 4))
+        return quat_rotate_inv(q, (pos - self.place)) / (self.factor * self.scale)
 
     def below(self) -> float:
         """The scale that reaches what hangs on the root joint."""
@@ -69,7 +74,7 @@ def base_of(nodes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Base:
     for place, turn, scale in nodes:
         out = Base(
             out.place + _turned(out.turn, out.factor * out.scale * place),
-            quat_mul(torch.tensor(out.turn), torch.tensor(turn)).numpy(),
+            quat_mul(out.turn, turn),
             out.below(),
             np.array(scale, dtype=np.float64),
         )
@@ -78,7 +83,7 @@ def base_of(nodes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Base:
 
 def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors `v (..., 3)` turned by one rotation."""
-    return quat_rotate(torch.tensor(q).expand(*v.shape[:-1], 4), torch.tensor(v)).numpy()
+    return quat_rotate(np.broadcast_to(q, (*v.shape[:-1], 4)), v)
 
 
 def turn_and_scale(
@@ -99,7 +104,7 @@ def turn_and_scale(
         raise PoiseError(f"its {what} mirrors space, which a body cannot do", where, code="mirrored")
     if np.abs(np.swapaxes(turn, -1, -2) @ turn - np.eye(3)).max() > _SHEAR:
         raise PoiseError(f"its {what} shears space", where, hint, code="sheared")
-    return matrix_to_quat(torch.tensor(turn)).numpy(), scale
+    return matrix_to_quat(turn), scale
 
 
 def rigid_bones(
@@ -126,7 +131,7 @@ def rigid_bones(
         paths[j] = factor[up] * scale[up] * place[j]
         offsets[j] = np.median(paths[j], axis=0)
     rot = np.stack([np.broadcast_to(q, (frames, 4)) for q in turn], 1)
-    rot[:, 0] = quat_mul(torch.tensor(base.turn).expand(frames, 4), torch.tensor(rot[:, 0])).numpy()
+    rot[:, 0] = quat_mul(np.broadcast_to(base.turn, (frames, 4)), rot[:, 0])
     root_pos = base.place + _turned(base.turn, base.factor * base.scale * place[0])
     root_pos = np.array(np.broadcast_to(root_pos, (frames, 3)))
     moves = [x for x in (root_pos, *paths.values()) if np.ptp(x, axis=0).max() > 0]
@@ -180,7 +185,7 @@ def checked_unit(
     if len(bones.rot) < 2 or not np.abs(bones.offsets).max() > 0:
         return stated
     at = sampled(len(bones.rot))
-    pos, _ = posed(parents, bones.offsets, bones.root_pos[at], bones.rot[at])
+    pos, _ = forward_kinematics(parents, bones.offsets, bones.root_pos[at], bones.rot[at])
     up = guess_up(names, pos, pos[0])
     if options.up_axis is None and up.value != up_axis and "uncertain" not in up.note:
         notes.append(

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.arrays import numeric, refuse_bad, require
@@ -21,6 +20,7 @@ from poise.formats.text import CUT_OFF, MAX_VALUE, decode, listed, number_table,
 from poise.motion.clip import Clip, check_frames
 from poise.motion.rotations import axis_angle_to_quat, quat_mul
 from poise.motion.skeleton import Channel
+from poise.motion.vectors import norm
 
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _LEGS = ("hip_flexion_r", "hip_flexion_l", "knee_angle_r", "knee_angle_l")
@@ -240,7 +240,7 @@ def _turned(joint: str, turns: Mapping[str, np.ndarray]) -> np.ndarray:
     lists = _TURNS[joint if not side else f"{joint[:-1]}*"]
     chosen = next((x for x in lists if any(_side(n, side) in turns for _, ns in x for n in ns)), ())
     count = len(turns["pelvis_tilt"])
-    out = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(count, 1)
+    out = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     for axis, names in chosen:
         angle = sum((turns[n] for n in (_side(n, side) for n in names) if n in turns), np.zeros(count))
         if side == "l":
@@ -249,7 +249,7 @@ def _turned(joint: str, turns: Mapping[str, np.ndarray]) -> np.ndarray:
         if joint.startswith("knee") and np.median(angle) > 0:
             # Newer models count the bent knee as positive; the shin always goes back.
             angle = -angle
-        unit = torch.tensor(axis, dtype=torch.float64)
-        turn = axis_angle_to_quat((unit / unit.norm()).expand(count, 3), torch.tensor(angle))
+        unit = np.asarray(axis, dtype=float)
+        turn = axis_angle_to_quat(np.broadcast_to(unit / norm(unit), (count, 3)), angle)
         out = quat_mul(out, turn)
-    return out.numpy()
+    return out

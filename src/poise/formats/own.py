@@ -12,8 +12,6 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
 from poise.formats.arrays import npz_bytes, numeric, one_number, refuse_bad, require, text_of
@@ -448,14 +446,13 @@ def _joints(data: Mapping[str, Any], key: str, path: Path) -> np.ndarray:
     return value.astype(int)
 
 
-def pack_clips(clips: Sequence[Clip]) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
-    """Tensors named `"<i>/root_pos"`, `"<i>/rot"`, `"<i>/offsets"`, and one JSON object per clip."""
-    tensors: dict[str, Tensor] = {}
+def pack_clips(clips: Sequence[Clip]) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
+    """Arrays named `"<i>/root_pos"`, `"<i>/rot"`, `"<i>/offsets"`, and one JSON object per clip."""
+    arrays: dict[str, np.ndarray] = {}
     notes: list[dict[str, Any]] = []
     for i, clip in enumerate(clips):
-        tensors[f"{i}/root_pos"] = torch.tensor(clip.root_pos)
-        tensors[f"{i}/rot"] = torch.tensor(clip.rot)
-        tensors[f"{i}/offsets"] = torch.tensor(np.array(clip.skeleton.offsets))
+        arrays[f"{i}/root_pos"], arrays[f"{i}/rot"] = clip.arrays()
+        arrays[f"{i}/offsets"] = clip.skeleton.offsets.copy()
         notes.append(
             {
                 "name": clip.name,
@@ -467,31 +464,31 @@ def pack_clips(clips: Sequence[Clip]) -> tuple[dict[str, Tensor], list[dict[str,
                 "source": dataclasses.asdict(clip.skeleton.source),
             }
         )
-    return tensors, notes
+    return arrays, notes
 
 
-def unpack_clips(tensors: Mapping[str, Tensor], notes: Sequence[Mapping[str, Any]]) -> list[Clip]:
-    """What `pack_clips` packed.
+def unpack_clips(arrays: Mapping[str, Any], notes: Sequence[Mapping[str, Any]]) -> list[Clip]:
+    """What `pack_clips` packed, as arrays or as tensors.
 
     Raises:
         PoiseError: a key is missing, or of another kind.
     """
     try:
-        return [_clip(tensors, note, i) for i, note in enumerate(notes)]
+        return [_clip(arrays, note, i) for i, note in enumerate(notes)]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as problem:
         raise PoiseError(f"the packed clips are incomplete: {problem}", code="file-damaged") from None
 
 
-def _clip(tensors: Mapping[str, Tensor], note: Mapping[str, Any], i: int) -> Clip:
+def _clip(arrays: Mapping[str, Any], note: Mapping[str, Any], i: int) -> Clip:
     def told(key: str, kind: Any) -> Any:
         return fitted(note[key], kind)
 
     skeleton = Skeleton(
         told("names", tuple[str, ...]),
         told("parents", tuple[int, ...]),
-        tensors[f"{i}/offsets"].numpy(),
+        np.asarray(arrays[f"{i}/offsets"]),
         told("ends", tuple[tuple[int, tuple[float, float, float]], ...]),
         told("source", Source),
     )
-    root_pos, rot = tensors[f"{i}/root_pos"].numpy(), tensors[f"{i}/rot"].numpy()
+    root_pos, rot = np.asarray(arrays[f"{i}/root_pos"]), np.asarray(arrays[f"{i}/rot"])
     return Clip(skeleton, root_pos, rot, told("fps", float), told("name", str), told("cyclic", bool))

@@ -128,7 +128,8 @@ CALLS: dict[str, Callable[..., Any]] = {
 
 
 _MAX_STEPS = 5_000_000
-_Library: Any = pickle._Unpickler  # type: ignore[attr-defined]
+# The public `pickle.Unpickler` is the machine in C, whose instructions cannot be taken away.
+_Library: Any = pickle._Unpickler  # type: ignore[attr-defined]  # noqa: SLF001
 _TYPES = ("numpy.ndarray", "__builtin__.object", "builtins.object")
 _CORE = ("numpy.core.", "numpy._core.")
 _DAMAGE = (

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.formats.landmarks import complete, places_of
@@ -16,6 +14,7 @@ from poise.formats.text import listed
 from poise.motion.clip import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.skeleton import Skeleton, triple
+from poise.motion.vectors import lower_median, norm
 from poise.settings import Checked, NotNegative, Positive
 
 _LIMBS = {"UpLeg": "hip", "Leg": "knee", "Foot": "ankle", "ToeBase": "toe"}
@@ -55,7 +54,7 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     config = config or FitConfig()
     marks = complete(points, config.max_gap_s, config.drop_spikes, config.smooth_hz)
     notes = list(marks.notes)
-    tracks, spine = trunk_tracks({p: torch.tensor(t) for p, t in marks.tracks.items()}, notes)
+    tracks, spine = trunk_tracks(dict(marks.tracks), notes)
     if not _span(tracks) > 1e-6:
         raise PoiseError(
             "all keypoints lie in one place",
@@ -76,7 +75,7 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
         tuple((names.index(n), triple(tip)) for n, tip in rest.tips.items()),
         points.source,
     )
-    clip = Clip(skeleton, root_pos.numpy(), rot.numpy(), points.fps, points.name)
+    clip = Clip(skeleton, root_pos, rot, points.fps, points.name)
     stop = marks.first + clip.frames
     note = _misfit_note(fit_distances(_cut(points, marks.first, stop), clip))
     all_notes = (*points.source.notes, *notes, note)
@@ -110,10 +109,10 @@ def _cut(points: Keypoints, start: int, stop: int) -> Keypoints:
     return replace(points, positions=points.positions[start:stop], confidence=part)
 
 
-def _span(tracks: dict[str, Tensor]) -> float:
+def _span(tracks: dict[str, np.ndarray]) -> float:
     """How far the body reaches (m) in half of the frames at least."""
-    every = torch.stack([tracks["left_hip"], tracks["left_ankle"], tracks["right_shoulder"]])
-    return float((every - every[:1]).norm(dim=-1).amax(0).median())
+    every = np.stack([tracks["left_hip"], tracks["left_ankle"], tracks["right_shoulder"]])
+    return float(lower_median(norm(every - every[:1]).max(0)))
 
 
 def bones_of(rest: Rest) -> list[tuple[str, str, float]]:

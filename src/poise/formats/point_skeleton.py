@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.formats.markers import SIDES
 from poise.formats.text import listed
@@ -24,6 +22,7 @@ from poise.motion.rotations import (
     slerp,
     unwrap_quats,
 )
+from poise.motion.vectors import cross, lower_median, norm
 
 # The rest pose stands in the T-pose, faces -Y and has its left at +X.
 LEFT, BACK, UP = np.eye(3)
@@ -66,19 +65,20 @@ class Rest:
         self.parents[name], self.offsets[name], self.points[name] = parent, np.asarray(offset), place
 
 
-def spine_shares(tracks: dict[str, Tensor]) -> dict[str, float]:
+def spine_shares(tracks: dict[str, np.ndarray]) -> dict[str, float]:
     """How far up each of the spine's places lies on the way from the pelvis to the neck, by median."""
     line = tracks["neck"] - tracks["pelvis"]
+    square = np.maximum(np.square(line).sum(-1), 1e-12)
     return {
-        place: float((((track - tracks["pelvis"]) * line).sum(-1) / line.square().sum(-1)).median())
+        place: float(lower_median(((track - tracks["pelvis"]) * line).sum(-1) / square))
         for place, track in tracks.items()
         if place.startswith("spine")
     }
 
 
 def trunk_tracks(
-    tracks: dict[str, Tensor], notes: list[str], share: dict[str, float] | None = None
-) -> tuple[dict[str, Tensor], list[str]]:
+    tracks: dict[str, np.ndarray], notes: list[str], share: dict[str, float] | None = None
+) -> tuple[dict[str, np.ndarray], list[str]]:
     """The tracks with pelvis, spine, neck and head joint, interpolated where they were not measured, and
     the spine's places from below.
 
@@ -124,7 +124,7 @@ def trunk_tracks(
     return out, spine
 
 
-def _head(tracks: dict[str, Tensor]) -> Tensor:
+def _head(tracks: dict[str, np.ndarray]) -> np.ndarray:
     neck = tracks["neck"]
     if "head_top" in tracks:
         return neck + _HEAD_OF_TOP * (tracks["head_top"] - neck)
@@ -134,10 +134,10 @@ def _head(tracks: dict[str, Tensor]) -> Tensor:
             return (tracks[left] + tracks[right]) / 2
     trunk = neck - tracks["pelvis"]
     length = _HEAD_SHARE / _LEG_SHARE * _leg(tracks)
-    return neck + length * trunk / trunk.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    return neck + length * trunk / np.maximum(norm(trunk, keepdims=True), 1e-9)
 
 
-def _leg(tracks: dict[str, Tensor]) -> float:
+def _leg(tracks: dict[str, np.ndarray]) -> float:
     """Median length of a leg from hip to ankle along its bones, m."""
     return float(
         np.mean([_median(tracks, f"{s}_{a}", f"{s}_{b}") for s in SIDES for a, b in
@@ -145,23 +145,23 @@ def _leg(tracks: dict[str, Tensor]) -> float:
     )  # fmt: skip
 
 
-def _median(tracks: dict[str, Tensor], a: str, b: str) -> float:
+def _median(tracks: dict[str, np.ndarray], a: str, b: str) -> float:
     """Median distance of two places over the frames, m."""
-    return float((tracks[a] - tracks[b]).norm(dim=-1).median())
+    return float(lower_median(norm(tracks[a] - tracks[b])))
 
 
-def _local(frame: Tensor, v: Tensor) -> np.ndarray:
+def _local(frame: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Median of the vectors `(T, 3)` as seen from frames `(T, 4)`, in rest axes."""
-    return quat_rotate_inv(frame, v).median(0).values.numpy()
+    return lower_median(quat_rotate_inv(frame, v), 0)
 
 
-def pelvis_frame(tracks: dict[str, Tensor], spine: str) -> Tensor:
+def pelvis_frame(tracks: dict[str, np.ndarray], spine: str) -> np.ndarray:
     """wxyz `(T, 4)`: x from right to left hip, z towards the spine."""
     hips = (tracks["left_hip"] + tracks["right_hip"]) / 2
     return frame_quat(tracks["left_hip"] - tracks["right_hip"], tracks[spine] - hips)
 
 
-def collars_tell_sides(tracks: dict[str, Tensor]) -> bool:
+def collars_tell_sides(tracks: dict[str, np.ndarray]) -> bool:
     """Whether there are collars, and not both in one place, as where they hang on the neck."""
     if not all(f"{s}_collar" in tracks for s in SIDES):
         return False
@@ -169,15 +169,15 @@ def collars_tell_sides(tracks: dict[str, Tensor]) -> bool:
     return apart > _ONE_PLACE * width
 
 
-def chest_frame(tracks: dict[str, Tensor], chest: str) -> Tensor:
+def chest_frame(tracks: dict[str, np.ndarray], chest: str) -> np.ndarray:
     """wxyz `(T, 4)`: z from the chest joint to the neck, x from right to left shoulder."""
     up = tracks["neck"] - tracks[chest]
     part = "collar" if collars_tell_sides(tracks) else "shoulder"
-    x = rejected(tracks[f"left_{part}"] - tracks[f"right_{part}"], up / up.norm(dim=-1, keepdim=True))
+    x = rejected(tracks[f"left_{part}"] - tracks[f"right_{part}"], up / norm(up, keepdims=True))
     return frame_quat(x, up)
 
 
-def foot_axes(tracks: dict[str, Tensor], side: str) -> tuple[Tensor, Tensor]:
+def foot_axes(tracks: dict[str, np.ndarray], side: str) -> tuple[np.ndarray, np.ndarray]:
     """Forward along the sole and towards the left `(T, 3)`, unit length up to rounding.
 
     Forward is from heel to toes, or from the ankle where no heel is seen; left is square to it and to
@@ -186,12 +186,12 @@ def foot_axes(tracks: dict[str, Tensor], side: str) -> tuple[Tensor, Tensor]:
     ankle = tracks[f"{side}_ankle"]
     front = tracks[f"{side}_toe_tip" if f"{side}_toe_tip" in tracks else f"{side}_toe"]
     forward = front - tracks.get(f"{side}_heel", ankle)
-    left = torch.linalg.cross(tracks[f"{side}_knee"] - ankle, forward, dim=-1)
-    unit = forward / forward.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    return unit, left / left.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    left = cross(tracks[f"{side}_knee"] - ankle, forward)
+    unit = forward / np.maximum(norm(forward, keepdims=True), 1e-9)
+    return unit, left / np.maximum(norm(left, keepdims=True), 1e-9)
 
 
-def measure(tracks: dict[str, Tensor], spine: list[str], notes: list[str]) -> Rest:
+def measure(tracks: dict[str, np.ndarray], spine: list[str], notes: list[str]) -> Rest:
     """The rest skeleton of completed tracks (`trunk_tracks`): medians over all frames, left as right."""
     rest = Rest(notes=notes)
     rest.add("Hips", None, np.zeros(3), "pelvis")
@@ -226,12 +226,12 @@ def _mirrored(by_side: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"left": left, "right": image * left}
 
 
-def _both(tracks: dict[str, Tensor], a: str, b: str) -> float:
+def _both(tracks: dict[str, np.ndarray], a: str, b: str) -> float:
     """The length of a bone of both sides: the mean of their medians, m."""
     return float(np.mean([_median(tracks, f"{s}_{a}", f"{s}_{b}") for s in SIDES]))
 
 
-def _leg_joints(rest: Rest, tracks: dict[str, Tensor], side: str, hip: np.ndarray) -> None:
+def _leg_joints(rest: Rest, tracks: dict[str, np.ndarray], side: str, hip: np.ndarray) -> None:
     name = TITLE[side]
     rest.add(f"{name}UpLeg", "Hips", hip, f"{side}_hip")
     rest.add(f"{name}Leg", f"{name}UpLeg", -UP * _both(tracks, "hip", "knee"), f"{side}_knee")
@@ -261,12 +261,12 @@ def _leg_joints(rest: Rest, tracks: dict[str, Tensor], side: str, hip: np.ndarra
         rest.tips[f"{name}ToeBase"] = tip - ball
 
 
-def _ball_track(tracks: dict[str, Tensor], side: str) -> Tensor:
+def _ball_track(tracks: dict[str, np.ndarray], side: str) -> np.ndarray:
     start = tracks.get(f"{side}_heel", tracks[f"{side}_ankle"])
     return start + _BALL_SHARE * (tracks[f"{side}_toe_tip"] - start)
 
 
-def _foot_cluster(tracks: dict[str, Tensor], side: str) -> dict[str, np.ndarray]:
+def _foot_cluster(tracks: dict[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
     """Places of toe, toe tip and heel as seen from the ankle in a foot that stands, m.
 
     With a heel the sole's line is level. Without, the ball lies a usual height below the ankle.
@@ -277,7 +277,7 @@ def _foot_cluster(tracks: dict[str, Tensor], side: str) -> dict[str, np.ndarray]
     ankle = tracks[f"{side}_ankle"]
     if "heel" in parts:
         forward, left = foot_axes(tracks, side)
-        frame = frame_quat(left, torch.linalg.cross(forward, left, dim=-1))
+        frame = frame_quat(left, cross(forward, left))
         return {p: _local(frame, tracks[f"{side}_{p}"] - ankle) for p in parts}
     leg = _leg(tracks)
     return {p: _sloping(_median(tracks, f"{side}_ankle", f"{side}_{p}"), leg) for p in parts}
@@ -289,7 +289,7 @@ def _sloping(length: float, leg: float) -> np.ndarray:
     return -BACK * np.sqrt(length**2 - drop**2) - UP * drop
 
 
-def _arm_joints(rest: Rest, tracks: dict[str, Tensor], chest: str, parent: str) -> None:
+def _arm_joints(rest: Rest, tracks: dict[str, np.ndarray], chest: str, parent: str) -> None:
     frame, at = chest_frame(tracks, chest), tracks[chest]
     own = all(f"{s}_collar" in tracks for s in SIDES)
     part = "collar" if own else "shoulder"
@@ -308,7 +308,7 @@ def _arm_joints(rest: Rest, tracks: dict[str, Tensor], chest: str, parent: str) 
             rest.tips[f"{name}Hand"] = out * _median(tracks, f"{side}_wrist", f"{side}_hand")
 
 
-def _note_asymmetry(rest: Rest, tracks: dict[str, Tensor]) -> None:
+def _note_asymmetry(rest: Rest, tracks: dict[str, np.ndarray]) -> None:
     odd = []
     bones = (("hip", "knee", "thigh"), ("knee", "ankle", "shin"), ("shoulder", "elbow", "upper arm"))
     for a, b, name in (*bones, ("elbow", "wrist", "forearm")):
@@ -330,19 +330,19 @@ _FOOT_HINT = 0.12
 _ROUNDS = 30
 
 
-def _vector(v: np.ndarray) -> Tensor:
-    return torch.tensor(np.asarray(v), dtype=torch.float64)
+def _vector(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v, dtype=float)
 
 
 class Solver:
     """Poses joint after joint from the root outwards; world frame, `(T, ...)`."""
 
-    def __init__(self, rest: Rest, tracks: dict[str, Tensor], fps: float):
+    def __init__(self, rest: Rest, tracks: dict[str, np.ndarray], fps: float):
         self.rest, self.tracks, self.fps = rest, tracks, fps
-        self.pos: dict[str, Tensor] = {}
-        self.quat: dict[str, Tensor] = {}
+        self.pos: dict[str, np.ndarray] = {}
+        self.quat: dict[str, np.ndarray] = {}
 
-    def run(self) -> tuple[Tensor, Tensor]:
+    def run(self) -> tuple[np.ndarray, np.ndarray]:
         """Root positions `(T, 3)` m and local rotations `(T, J, 4)` wxyz in the order of `rest`."""
         self._pelvis()
         self._trunk()
@@ -354,44 +354,46 @@ class Solver:
         for name, parent in self.rest.parents.items():
             quat = self.quat[name]
             local.append(quat if parent is None else quat_mul(quat_conj(self.quat[parent]), quat))
-        return self.pos["Hips"], unwrap_quats(normalize(torch.stack(local, 1)))
+        return self.pos["Hips"], unwrap_quats(normalize(np.stack(local, 1)))
 
-    def _track(self, name: str) -> Tensor:
+    def _track(self, name: str) -> np.ndarray:
         return self.tracks[self.rest.points[name]]
 
     def _place(self, name: str) -> None:
         """Where a joint comes to lie, from its parent's pose."""
         parent = self.rest.parents[name]
         assert parent is not None
-        offset = _vector(self.rest.offsets[name]).expand_as(self.pos[parent])
+        offset = np.broadcast_to(_vector(self.rest.offsets[name]), self.pos[parent].shape)
         self.pos[name] = self.pos[parent] + quat_rotate(self.quat[parent], offset)
 
-    def _aim(self, name: str, child: str) -> Tensor:
+    def _aim(self, name: str, child: str) -> np.ndarray:
         """The smallest turn from the parent's pose that points a bone at its child's track."""
         parent = self.rest.parents[name]
         assert parent is not None
-        bone = _vector(self.rest.offsets[child]).expand_as(self.pos[name])
+        bone = np.broadcast_to(_vector(self.rest.offsets[child]), self.pos[name].shape)
         now = quat_rotate(self.quat[parent], bone)
         return quat_mul(shortest_arc(now, self._track(child) - self.pos[name]), self.quat[parent])
 
     def _pelvis(self) -> None:
         """Root pose: the turn and place that fit hips and first spine joint best, in closed form."""
         names = ["LeftUpLeg", "RightUpLeg", self.rest.spine[0]]
-        template = torch.stack([_vector(self.rest.offsets[n]) for n in names])
-        seen = torch.stack([self._track(n) for n in names], 1)
-        weights = torch.tensor([1.0, 1.0, 0.5], dtype=torch.float64)
+        template = np.stack([_vector(self.rest.offsets[n]) for n in names])
+        seen = np.stack([self._track(n) for n in names], 1)
+        weights = np.array([1.0, 1.0, 0.5], dtype=float)
         weights = weights / weights.sum()
         middle, centre = weights @ template, (weights[:, None] * seen).sum(1)
         quat = cluster_quat(template - middle, seen - centre[:, None], weights)
         self.quat["Hips"] = quat
         # The legs hang on the pelvis: the middle of the hips is met exactly.
         hips = (template[0] + template[1]) / 2
-        self.pos["Hips"] = (seen[:, 0] + seen[:, 1]) / 2 - quat_rotate(quat, hips.expand_as(centre))
+        self.pos["Hips"] = (seen[:, 0] + seen[:, 1]) / 2 - quat_rotate(
+            quat, np.broadcast_to(hips, centre.shape)
+        )
 
     def _trunk(self) -> None:
         """The spine points from joint to joint and shares the twist between pelvis and chest."""
         spine = self.rest.spine
-        lateral = _vector(LEFT).expand_as(self.pos["Hips"])
+        lateral = np.broadcast_to(_vector(LEFT), self.pos["Hips"].shape)
         chest = chest_frame(self.tracks, self.rest.points[spine[-1]])
         for i, name in enumerate(spine):
             self._place(name)
@@ -399,12 +401,12 @@ class Solver:
                 self.quat[name] = self._chest(name)
                 break
             up = self._track(spine[i + 1]) - self.pos[name]
-            share = torch.full_like(up[:, 0], (i + 1) / len(spine))
+            share = np.full_like(up[:, 0], (i + 1) / len(spine))
             between = slerp(self.quat["Hips"], chest, share)
             x = rejected(quat_rotate(between, lateral), normalize(up))
             self.quat[name] = frame_quat(x, up)
 
-    def _chest(self, name: str) -> Tensor:
+    def _chest(self, name: str) -> np.ndarray:
         """The chest's rotation: neck and collars (or shoulders, which count less) as one cluster."""
         own = collars_tell_sides(self.tracks)
         names, template = ["Neck"], [self.rest.offsets["Neck"]]
@@ -413,9 +415,9 @@ class Solver:
             reach = 0.0 if own else self.rest.offsets[f"{TITLE[side]}Arm"]
             names.append(f"{TITLE[side]}{'Shoulder' if own else 'Arm'}")
             template.append(collar + reach)
-        seen = torch.stack([self._track(n) - self.pos[name] for n in names], 1)
-        weights = torch.tensor([1.0, 1.0, 1.0] if own else [1.0, 0.5, 0.5], dtype=torch.float64)
-        return cluster_quat(torch.stack([_vector(v) for v in template]), seen, weights)
+        seen = np.stack([self._track(n) - self.pos[name] for n in names], 1)
+        weights = np.asarray([1.0, 1.0, 1.0] if own else [1.0, 0.5, 0.5], dtype=float)
+        return cluster_quat(np.stack([_vector(v) for v in template]), seen, weights)
 
     def _head(self) -> None:
         self._place("Neck")
@@ -427,7 +429,7 @@ class Solver:
         if pair is not None:
             left = tracks[pair[0]] - tracks[pair[1]]
         elif "face" in tracks:
-            left = torch.linalg.cross(up, tracks["face"] - tracks["neck"], dim=-1)
+            left = cross(up, tracks["face"] - tracks["neck"])
         else:
             self.quat["Head"] = self.quat["Neck"]
             return
@@ -451,11 +453,15 @@ class Solver:
         self._place(hand)
         self.quat[hand] = self.quat[lower]
         if f"{side}_hand" in self.tracks:
-            now = quat_rotate(self.quat[lower], _vector(self.rest.tips[hand]).expand_as(self.pos[hand]))
+            now = quat_rotate(
+                self.quat[lower], np.broadcast_to(_vector(self.rest.tips[hand]), self.pos[hand].shape)
+            )
             seen = self.tracks[f"{side}_hand"] - self.tracks[f"{side}_wrist"]
             self.quat[hand] = quat_mul(shortest_arc(now, seen), self.quat[lower])
 
-    def _hinged(self, upper: str, lower: str, end: str, axis: Tensor, hint: Tensor | None) -> None:
+    def _hinged(
+        self, upper: str, lower: str, end: str, axis: np.ndarray, hint: np.ndarray | None
+    ) -> None:
         """Two bones with a hinge of the rest axis `axis (3)` between them.
 
         The upper one points at the hinge's track, and twists so that the bend lies about the hinge's
@@ -468,12 +474,12 @@ class Solver:
         knee = self.pos[upper] + d1 * float(np.linalg.norm(self.rest.offsets[lower]))
         d2 = normalize(self._track(end) - knee)
         # The bend's axis times the sine of the bend.
-        hinge = torch.linalg.cross(d1, d2)
+        hinge = cross(d1, d2)
         if hint is not None:
             hinge = hinge + rejected(hint, d1)
-        zero = quat_rotate(swing, axis.expand_as(d1))
-        quarter = torch.linalg.cross(d1, zero)
-        shown = torch.stack(((hinge * zero).sum(-1), (hinge * quarter).sum(-1)), -1)
+        zero = quat_rotate(swing, np.broadcast_to(axis, d1.shape))
+        quarter = cross(d1, zero)
+        shown = np.stack(((hinge * zero).sum(-1), (hinge * quarter).sum(-1)), -1)
         angle = steady_twist(shown, self.fps)
         self.quat[upper] = quat_mul(axis_angle_to_quat(d1, angle), swing)
         self._place(lower)
@@ -491,16 +497,16 @@ class Solver:
         ankle = self.tracks[f"{side}_ankle"]
         left = foot_axes(self.tracks, side)[1]
         places = list(cluster)
-        template = torch.stack([*(_vector(cluster[p]) for p in places), 0.1 * _vector(LEFT)])
-        seen = torch.stack([*(self.tracks[f"{side}_{p}"] - ankle for p in places), 0.1 * left], 1)
-        weights = torch.ones(len(places) + 1, dtype=torch.float64)
+        template = np.stack([*(_vector(cluster[p]) for p in places), 0.1 * _vector(LEFT)])
+        seen = np.stack([*(self.tracks[f"{side}_{p}"] - ankle for p in places), 0.1 * left], 1)
+        weights = np.ones(len(places) + 1)
         weights[-1] = 0.2
         self.quat[foot] = cluster_quat(template, seen, weights)
         self._place(toe)
         self.quat[toe] = self.quat[foot]
 
 
-def steady_twist(shown: Tensor, fps: float) -> Tensor:
+def steady_twist(shown: np.ndarray, fps: float) -> np.ndarray:
     """Twist angles `(T)` from observations `(T, 2)`: cosine and sine, as long as they can be trusted.
 
     Minimises sum w |z_t - o_t|^2 + (TWIST_S fps)^2 |z_t+1 - z_t|^2 + e |z_t - 1|^2 over complex z, with
@@ -508,27 +514,27 @@ def steady_twist(shown: Tensor, fps: float) -> Tensor:
     it counts fully. Where no bend shows the twist, it passes from one observation to the next; without
     any, it is zero. Complex numbers know no jump from pi to -pi.
     """
-    length = shown.norm(dim=-1)
-    weight = (length / _BENT).pow(4).clamp(max=1e3)
-    unit = shown / length.clamp_min(1e-12).unsqueeze(-1)
+    length = norm(shown)
+    weight = np.minimum(np.power(length / _BENT, 4), 1e3)
+    unit = shown / np.maximum(length, 1e-12)[..., None]
     # No shoulder or hip twists beyond some 130 degrees: there the bend is a noisy, straight limb's.
-    weight = weight * ((unit[..., 0] + _BEYOND) / _BEYOND).clamp(0.0, 1.0)
+    weight = weight * np.clip((unit[..., 0] + _BEYOND) / _BEYOND, 0.0, 1.0)
     prior, between = 1e-6, (TWIST_S * fps) ** 2
-    right = weight.unsqueeze(-1) * unit
-    right = right + prior * torch.tensor([1.0, 0.0], dtype=shown.dtype)
+    right = weight[..., None] * unit
+    right = right + prior * np.array([1.0, 0.0], dtype=shown.dtype)
     diagonal = weight + prior + between * 2.0
     diagonal[0], diagonal[-1] = diagonal[0] - between, diagonal[-1] - between
     # The upper band; its first number stands outside the matrix, and a single frame has none.
-    bands = np.stack((np.full(len(diagonal), -between), diagonal.numpy()))
+    bands = np.stack((np.full(len(diagonal), -between), diagonal))
     from scipy.linalg import solveh_banded
 
-    z = solveh_banded(bands[-len(diagonal) :], right.numpy())
-    return torch.atan2(torch.tensor(z[:, 1]), torch.tensor(z[:, 0]))
+    z = solveh_banded(bands[-len(diagonal) :], right)
+    return np.arctan2(z[:, 1], z[:, 0])
 
 
 def hold_lengths(
-    tracks: dict[str, Tensor], bones: list[tuple[str, str, float]], rounds: int = _ROUNDS
-) -> dict[str, Tensor]:
+    tracks: dict[str, np.ndarray], bones: list[tuple[str, str, float]], rounds: int = _ROUNDS
+) -> dict[str, np.ndarray]:
     """The tracks moved as little as needed so that each bone `(place, place, m)` has its length.
 
     Each round moves both ends of every bone by half of its error (position-based dynamics, Mueller et
@@ -538,7 +544,7 @@ def hold_lengths(
     for _ in range(rounds):
         for a, b, length in bones:
             line = out[b] - out[a]
-            now = line.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+            now = np.maximum(norm(line, keepdims=True), 1e-9)
             move = line * (0.5 * (now - length) / now)
             out[a], out[b] = out[a] + move, out[b] - move
     return out

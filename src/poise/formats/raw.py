@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.guess import (
@@ -26,8 +25,8 @@ from poise.formats.text import MAX_JOINTS, shown
 from poise.motion.clip import Clip, check_frames, check_poses, check_rate
 from poise.motion.clip_info import body_height, sampled
 from poise.motion.roles import SIDES, find_roles
-from poise.motion.rotations import normalize, unwrap_quats
-from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
+from poise.motion.rotations import forward_kinematics, normalize, unwrap_quats
+from poise.motion.skeleton import Channel, Skeleton, Source, rest_positions, triple
 
 
 @dataclass(frozen=True)
@@ -228,7 +227,7 @@ def _unwrapped(rot: np.ndarray) -> np.ndarray:
     for at in range(0, len(out), BLOCK):
         # The frame before is settled and tells on which side the next ones lie.
         first = max(0, at - 1)
-        part = torch.from_numpy(out[first : at + BLOCK])
+        part = out[first : at + BLOCK]
         part[at - first :] = normalize(part[at - first :])
         part[...] = unwrap_quats(part)
     return out
@@ -284,7 +283,7 @@ def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
 def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple[Guess, Guess]:
     """The vertical and the metres per unit, stated or guessed, each with its evidence."""
     at = sampled(len(rot))
-    pos, _ = posed(raw.parents, raw.offsets, raw.root_pos[at], rot[at])
+    pos, _ = forward_kinematics(raw.parents, raw.offsets, raw.root_pos[at], rot[at])
     height, how = body_height(raw.names, raw.parents, raw.offsets, pos)
     if not height > 0:
         raise PoiseError(
@@ -302,7 +301,7 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
     if stated is not None:
         return Guess(stated.upper()), unit
     after = later_frames(at, options.fps or raw.fps, len(rot))
-    later, _ = posed(raw.parents, raw.offsets, raw.root_pos[after], rot[after])
+    later, _ = forward_kinematics(raw.parents, raw.offsets, raw.root_pos[after], rot[after])
     return guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets), later), unit
 
 

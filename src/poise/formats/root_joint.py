@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from poise.motion.clip_info import landmarks
 from poise.motion.rotations import forward_kinematics, quat_rotate, quat_rotate_inv
-from poise.motion.skeleton import Skeleton, line_to_root, posed
+from poise.motion.skeleton import Skeleton, line_to_root
 
 RIGID_SHARE = 6e-4
 """A joint is rigid if its place stays within this share of the skeleton's size: about 1 mm on a person,
@@ -73,7 +72,7 @@ def carried(
     moves = bool(np.abs(root_pos - root_pos[0]).max() > RIGID_SHARE * size)
     notes.append(travel_note(names[0], names[joint], moves))
     offsets[joint] = 0.0
-    turned = posed(parents, offsets, root_pos, rot)[1]
+    turned = forward_kinematics(parents, offsets, root_pos, rot)[1]
     # How far each joint on the way stands from where rigid bones alone would put it.
     off = {0: np.zeros_like(root_pos)}
     for k in way[1:]:
@@ -87,8 +86,8 @@ def carried(
             continue
         if up in off:
             # Its own place, seen from where its parent now stands.
-            shift = quat_rotate_inv(torch.tensor(turned[:, up]), torch.tensor(off[up] - off[joint]))
-            path = paths.get(j, own[j][None]) + shift.numpy()
+            shift = quat_rotate_inv(turned[:, up], (off[up] - off[joint]))
+            path = paths.get(j, own[j][None]) + shift
             offsets[j] = np.median(path, axis=0)
             beside[j] = float(np.linalg.norm(path - offsets[j], axis=-1).max())
             places[j] = own[j]
@@ -116,7 +115,7 @@ def text_of(v: np.ndarray) -> str:
 
 
 def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return quat_rotate(torch.tensor(q), torch.tensor(v).expand(len(q), 3)).numpy()
+    return quat_rotate(q, np.broadcast_to(v, (len(q), 3)))
 
 
 def _below(parents: Sequence[int], joint: int) -> set[int]:
@@ -227,19 +226,15 @@ def restored(skeleton: Skeleton, offsets: np.ndarray, root_pos: np.ndarray, rot:
     made = offsets.copy()
     for j, place in places.items():
         made[j] = place
-    turns = torch.tensor(rot)
-    pos, quat = forward_kinematics(parents, torch.tensor(offsets), torch.tensor(root_pos), turns)
-    zero, _ = forward_kinematics(
-        parents, torch.tensor(made), torch.zeros(len(rot), 3, dtype=turns.dtype), turns
-    )
+    pos, quat = forward_kinematics(parents, offsets, root_pos, rot)
+    zero, _ = forward_kinematics(parents, made, np.zeros((len(rot), 3)), rot)
     # zero[:, D] is how far D stands from the root on rigid bones.
-    root = np.where(np.isfinite(stood), stood, (pos[:, joint] - zero[:, joint]).numpy())
-    base = torch.tensor(root)
+    root = np.where(np.isfinite(stood), stood, pos[:, joint] - zero[:, joint])
     up = parents[joint]
-    path = quat_rotate_inv(quat[:, up], pos[:, joint] - (base + zero[:, up])).numpy()
+    path = quat_rotate_inv(quat[:, up], pos[:, joint] - (root + zero[:, up]))
     if not places:
         for j in set(range(1, len(parents))) - _below(parents, joint) - way:
             if parents[j] in way:
-                at = base + zero[:, parents[j]]
-                made[j] = np.median(quat_rotate_inv(quat[:, parents[j]], pos[:, j] - at).numpy(), axis=0)
+                at = root + zero[:, parents[j]]
+                made[j] = np.median(quat_rotate_inv(quat[:, parents[j]], pos[:, j] - at), axis=0)
     return Restored({0: root, joint: path}, made)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.arrays import npz_bytes, numeric, one_number, refuse_bad, require, text_of
@@ -40,8 +39,15 @@ from poise.formats.raw import (
 from poise.formats.text import listed, write_whole
 from poise.motion.clip import Clip, check_poses
 from poise.motion.clip_info import sampled
-from poise.motion.rotations import matrix_to_quat, quat_conj, quat_mul, quat_to_rotvec, rotvec_to_quat
-from poise.motion.skeleton import Channel, Skeleton, Source, posed, triple
+from poise.motion.rotations import (
+    forward_kinematics,
+    matrix_to_quat,
+    quat_conj,
+    quat_mul,
+    quat_to_rotvec,
+    rotvec_to_quat,
+)
+from poise.motion.skeleton import Channel, Skeleton, Source, triple
 
 _SIDES = (("left", 1.0), ("right", -1.0))
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -178,10 +184,10 @@ _UNSTATED = {_AIST_FPS: (60.0, 30.0), _HY_FPS: (30.0, 60.0)}
 _AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 
 
-def to_y_up(up: str) -> torch.Tensor:
+def to_y_up(up: str) -> np.ndarray:
     """`(4,)` wxyz, the turn of a world with the vertical `up` to Y up."""
     images = vectors_from_z_up(vectors_to_z_up(np.eye(3), up), "Y")
-    return matrix_to_quat(torch.tensor(images.T))
+    return matrix_to_quat(images.T)
 
 
 def is_smpl(keys: Mapping[str, Any] | Sequence[str]) -> bool:
@@ -222,7 +228,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
     notes = people
     pelvis, offsets = _rest(data, path, layout, notes)
     root_pos = trans / scale * world_unit + pelvis
-    quat = rotvec_to_quat(torch.tensor(poses))
+    quat = rotvec_to_quat(poses)
     fps = options.fps or _fps(data, path, notes)
     up, up_note = _up(data, options, layout, root_pos, quat, fps)
     notes += [*up_note, *_told(data)]
@@ -237,7 +243,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
         offsets=offsets,
         ends=layout.tips,
         root_pos=root_pos,
-        rot=quat.numpy(),
+        rot=quat,
         fps=fps,
         channels=(Channel(order=("axis-angle",)),) * len(layout.names),
         unit_m=1.0,
@@ -385,7 +391,7 @@ def _up(
     options: ReadOptions,
     layout: SmplLayout,
     root_pos: np.ndarray,
-    quat: torch.Tensor,
+    quat: np.ndarray,
     fps: float,
 ) -> tuple[str, list[str]]:
     """The world's vertical: stated, else Z as in AMASS (Y in AIST++) unless the body says otherwise.
@@ -405,7 +411,7 @@ def _up(
     at = sampled(len(root_pos))
     after = later_frames(at, fps, len(root_pos))
     pos, later = (
-        posed(layout.parents, layout.offsets, root_pos[k], quat[k].numpy())[0] for k in (at, after)
+        forward_kinematics(layout.parents, layout.offsets, root_pos[k], quat[k])[0] for k in (at, after)
     )
     plain = "The file states no vertical: Z taken, as AMASS has it"
     if any(key in data for key in _AMASS_RATES):
@@ -519,14 +525,14 @@ def write_amass(clip: Clip, path: str | Path) -> None:
     kept = dict(clip.skeleton.source.extra) if clip.skeleton.source.format == "smpl" else {}
     up = kept.get("up", "Z")
     pelvis = _numbers(kept.get("pelvis"), np.array(PELVIS))
-    quat = torch.tensor(quats_from_z_up(clip.rot, "Y"))
+    quat = quats_from_z_up(clip.rot, "Y")
     root_pos = vectors_from_z_up(clip.root_pos, "Y")
     if up != "Y":
         quat[:, 0] = quat_mul(quat_conj(to_y_up(up)), quat[:, 0])
         root_pos = vectors_from_z_up(vectors_to_z_up(root_pos, "Y"), up)
     rest = vectors_from_z_up(clip.skeleton.rest_positions(), "Y") + pelvis
     arrays = {
-        "poses": quat_to_rotvec(quat).reshape(clip.frames, -1).numpy(),
+        "poses": quat_to_rotvec(quat).reshape(clip.frames, -1),
         "trans": root_pos - pelvis,
         "betas": _numbers(kept.get("betas"), np.zeros(16)),
         "gender": np.array(kept.get("gender", "neutral")),

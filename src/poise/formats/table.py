@@ -7,40 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from poise.errors import PoiseError, brief
-from poise.formats.acclaim import read_amc, read_asf
-from poise.formats.bvh import read_bvh, write_bvh
-from poise.formats.c3d import c3d_points, looks_like_c3d
-from poise.formats.deepmimic import read_deepmimic
-from poise.formats.fbx import looks_like_fbx, read_fbx
-from poise.formats.fbx_write import write_fbx
-from poise.formats.gltf import read_gltf
-from poise.formats.gltf_write import write_gltf
-from poise.formats.named_arrays import (
-    looks_like_npz,
-    looks_like_pickle,
-    read_npz,
-    read_pickled,
-    write_npz,
-)
-from poise.formats.opensim import looks_like_mot, read_mot
-from poise.formats.own import looks_like_csv, read_csv, write_csv
-from poise.formats.point_raw import as_clip
-from poise.formats.point_tables import csv_points, looks_like_points_csv, looks_like_trc, trc_points
 from poise.formats.raw import ReadOptions, check_options
-from poise.formats.refused import (
-    looks_like_asf,
-    looks_like_openpose,
-    looks_like_robot,
-    refuse_asf,
-    refuse_folder,
-    refuse_openpose,
-    refuse_robot,
-)
 from poise.formats.text import below_comments, read_head, shown
-from poise.formats.usd import pxr_package, read_usd, write_usd
 from poise.motion.clip import Clip
+from poise.settings import imported
 
 
 @dataclass(frozen=True)
@@ -86,29 +59,102 @@ def _looks_like_usd(head: bytes) -> bool:
     return packed or head.startswith((b"PXR-USDC", b"#usda"))
 
 
+def _late(place: str) -> Callable[..., Any]:
+    """A function that is imported when it is first called: who reads one format waits for no other."""
+    return lambda *given: imported(place)(*given)
+
+
+def _points(place: str) -> Callable[[Path, ReadOptions], Clip]:
+    """A reader of keypoints, as that of a clip."""
+
+    def read(path: Path, options: ReadOptions) -> Clip:
+        from poise.formats.point_raw import as_clip
+
+        return as_clip(_late(place))(path, options)
+
+    return read
+
+
 READERS = (
-    Reader("BVH", (".bvh",), _looks_like_bvh, read_bvh),
-    Reader("ASF", (".asf",), looks_like_asf, refuse_asf),
-    Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
-    Reader("glTF", (".glb", ".gltf", ".vrm", ".vrma"), _looks_like_gltf, read_gltf),
-    Reader("USD", (".usd", ".usda", ".usdc", ".usdz"), _looks_like_usd, read_usd),
-    Reader("FBX", (".fbx",), looks_like_fbx, read_fbx),
-    Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
-    Reader("npz of AMASS, SMPL, Kimodo, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
+    Reader("BVH", (".bvh",), _looks_like_bvh, _late("poise.formats.bvh:read_bvh")),
+    Reader(
+        "ASF",
+        (".asf",),
+        _late("poise.formats.refused:looks_like_asf"),
+        _late("poise.formats.refused:refuse_asf"),
+    ),
+    Reader("AMC with ASF", (".amc",), _looks_like_amc, _late("poise.formats.acclaim:read_amc")),
+    Reader(
+        "glTF",
+        (".glb", ".gltf", ".vrm", ".vrma"),
+        _looks_like_gltf,
+        _late("poise.formats.gltf:read_gltf"),
+    ),
+    Reader(
+        "USD", (".usd", ".usda", ".usdc", ".usdz"), _looks_like_usd, _late("poise.formats.usd:read_usd")
+    ),
+    Reader(
+        "FBX", (".fbx",), _late("poise.formats.fbx:looks_like_fbx"), _late("poise.formats.fbx:read_fbx")
+    ),
+    Reader(
+        "DeepMimic", (".txt", ".json"), _looks_like_json, _late("poise.formats.deepmimic:read_deepmimic")
+    ),
+    Reader(
+        "npz of AMASS, SMPL, Kimodo, keypoints or Poise",
+        (".npz",),
+        _late("poise.formats.named_arrays:looks_like_npz"),
+        _late("poise.formats.named_arrays:read_npz"),
+    ),
     Reader(
         "pickled SMPL, poselib or MDM",
         (".pkl", ".npy"),
-        looks_like_pickle,
-        read_pickled,
+        _late("poise.formats.named_arrays:looks_like_pickle"),
+        _late("poise.formats.named_arrays:read_pickled"),
         asks=(".pkl",),
     ),
-    Reader("TRC keypoints", (".trc",), looks_like_trc, as_clip(trc_points)),
-    Reader("C3D markers", (".c3d",), looks_like_c3d, as_clip(c3d_points)),
-    Reader("OpenPose", (), looks_like_openpose, refuse_openpose),
-    Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
-    Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
-    Reader("CSV keypoints", (".csv",), looks_like_points_csv, as_clip(csv_points)),
-    Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=(".csv", ".h5")),
+    Reader(
+        "TRC keypoints",
+        (".trc",),
+        _late("poise.formats.point_tables:looks_like_trc"),
+        _points("poise.formats.point_tables:trc_points"),
+    ),
+    Reader(
+        "C3D markers",
+        (".c3d",),
+        _late("poise.formats.c3d:looks_like_c3d"),
+        _points("poise.formats.c3d:c3d_points"),
+    ),
+    Reader(
+        "OpenPose",
+        (),
+        _late("poise.formats.refused:looks_like_openpose"),
+        _late("poise.formats.refused:refuse_openpose"),
+    ),
+    Reader(
+        "OpenSim",
+        (".mot",),
+        _late("poise.formats.opensim:looks_like_mot"),
+        _late("poise.formats.opensim:read_mot"),
+    ),
+    Reader(
+        "CSV of Poise",
+        (".csv",),
+        _late("poise.formats.own:looks_like_csv"),
+        _late("poise.formats.own:read_csv"),
+    ),
+    Reader(
+        "CSV keypoints",
+        (".csv",),
+        _late("poise.formats.point_tables:looks_like_points_csv"),
+        _points("poise.formats.point_tables:csv_points"),
+    ),
+    Reader(
+        "robot",
+        (".csv", ".h5"),
+        _late("poise.formats.refused:looks_like_robot"),
+        _late("poise.formats.refused:refuse_robot"),
+        asks=(".csv", ".h5"),
+    ),
 )
 #: Readers that only say what to give instead.
 _REFUSERS = ("ASF", "robot", "OpenPose")
@@ -200,7 +246,7 @@ def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
         asf = None if skeleton is None else Path(skeleton)
         return _read(path, ReadOptions(asf, rest=True))
     try:
-        return read_asf(path)
+        return imported("poise.formats.acclaim:read_asf")(path)
     except PoiseError as error:
         raise brief(error, path) from None
 
@@ -209,7 +255,7 @@ def _reader_of(path: Path) -> Reader:
     with suppress(OSError):
         # A name that is too long, say; reading tells why.
         if path.is_dir():
-            refuse_folder(path)
+            imported("poise.formats.refused:refuse_folder")(path)
     head = read_head(path)
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     for reader in READERS:
@@ -237,16 +283,21 @@ def _reader_of(path: Path) -> Reader:
     )
 
 
+_BVH, _GLTF, _USD = (
+    _late("poise.formats.bvh:write_bvh"),
+    _late("poise.formats.gltf_write:write_gltf"),
+    _late("poise.formats.usd:write_usd"),
+)
 WRITERS: dict[str, Callable[[Clip, Path], None]] = {
-    ".bvh": write_bvh,
-    ".npz": write_npz,
-    ".csv": write_csv,
-    ".glb": write_gltf,
-    ".gltf": write_gltf,
-    ".usd": write_usd,
-    ".usda": write_usd,
-    ".usdc": write_usd,
-    ".fbx": write_fbx,
+    ".bvh": _BVH,
+    ".npz": _late("poise.formats.named_arrays:write_npz"),
+    ".csv": _late("poise.formats.own:write_csv"),
+    ".glb": _GLTF,
+    ".gltf": _GLTF,
+    ".usd": _USD,
+    ".usda": _USD,
+    ".usdc": _USD,
+    ".fbx": _late("poise.formats.fbx_write:write_fbx"),
 }
 
 
@@ -286,8 +337,8 @@ def names_file(path: Path) -> bool:
 
 def check_writable(path: Path) -> None:
     """Refuses a file if its suffix names no format that can be written here, before any work is done."""
-    if _writer(path) is write_usd:
-        pxr_package()
+    if _writer(path) is _USD:
+        imported("poise.formats.usd:pxr_package")()
 
 
 def _writer(path: Path) -> Callable[[Clip, Path], None]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.formats.figure import bone_figure
@@ -92,10 +91,10 @@ def raw_of_matrices(
             notes.append(f"The scale of {name} is animated; its median was taken for all frames")
     if len(top[0]) > 1:
         # The root joint carries what moves above it: x = p_above + R_above (s x_root).
-        turns = torch.tensor(top[1])
-        moved = quat_rotate(turns, torch.tensor(above * place[0])).numpy()
+        turns = top[1]
+        moved = quat_rotate(turns, (above * place[0]))
         place[0] = (top[0] + moved) / above
-        turn[0] = quat_mul(turns, torch.tensor(turn[0])).numpy()
+        turn[0] = quat_mul(turns, turn[0])
         base = base_of([(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), above)])
     else:
         base = base_of([(top[0][0], top[1][0], above)])
@@ -237,7 +236,7 @@ def _fill(pxr: Any, stage: Any, clip: Clip) -> None:
     axis, unit = (source.up_axis, source.unit_m) if own else ("Y", 1.0)
     offsets = vectors_from_z_up(skeleton.offsets, axis) / unit
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
-    rot = unwrap_quats(normalize(torch.tensor(quats_from_z_up(clip.rot, axis)))).numpy()
+    rot = unwrap_quats(normalize(quats_from_z_up(clip.rot, axis)))
     back = restored(skeleton, offsets, root_pos, rot) if own else Restored({0: root_pos}, offsets)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y if axis == "Y" else UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, unit)

@@ -404,7 +404,7 @@ def needs_of(imitation: Imitation, supports: Sequence[Support] = ()) -> tuple[Ne
     frames = int(reference.length[0])
     pose = reference.pose
     table, rate = imitation.humanoid.table, reference.rate_hz
-    needs = find_needs(table, pose.pos[:frames], pose.quat[:frames], rate)
+    needs = find_needs(table, pose.pos[:frames].numpy(), pose.quat[:frames].numpy(), rate)
     return tuple(
         n for n in needs if not any(s.start_s < n.stop_s and n.start_s < s.stop_s for s in supports)
     )

@@ -28,6 +28,7 @@ from poise.errors import PoiseError
 from poise.formats.own import pack_clips, unpack_clips
 from poise.jobs.library.files import same_library
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy, save_checkpoint
+from poise.learn.checkpoint import tensors_of
 from poise.motion import ClipLibrary, Skeleton
 from poise.settings import to_data
 
@@ -254,7 +255,9 @@ def write_run(
     folder.mkdir(parents=True, exist_ok=True)
     packed, notes = pack_clips(clips.clips)
     save_checkpoint(
-        folder / RUN_FILE, packed | dict(tensors or {}), {"kind": "run", **meta, "clips": notes}
+        folder / RUN_FILE,
+        tensors_of(packed) | dict(tensors or {}),
+        {"kind": "run", **meta, "clips": notes},
     )
 
 

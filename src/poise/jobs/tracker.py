@@ -27,7 +27,7 @@ from poise.jobs.library.clips import Target
 from poise.jobs.run_file import RUN_FILE
 from poise.kinematics import RetargetConfig, onto_own, own_body
 from poise.learn import PolicyBundle, Value, load_checkpoint, save_checkpoint
-from poise.learn.checkpoint import PolicyMeta, prefixed, under
+from poise.learn.checkpoint import PolicyMeta, prefixed, tensors_of, under
 from poise.learn.policy import policy_in
 from poise.motion import Clip, trim
 from poise.recipes.perpetual import lengths_seen
@@ -141,7 +141,7 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
     example = trim(tracker.example, 0, EXAMPLE_FRAMES)
     packed, clip = pack_clips([example])
     # The rotations only show how the skeleton stands; offsets are the body's and stay exact.
-    small = {k: v if "offsets" in k else v.float() for k, v in packed.items()}
+    small = {k: v if "offsets" in k else v.float() for k, v in tensors_of(packed).items()}
     tensors = {k: halved(k, v) for k, v in tracker.policy.state().items()}
     meta = {
         "kind": KIND,

@@ -6,13 +6,10 @@ import math
 from itertools import accumulate
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
 from poise.motion.rotations import (
     euler_to_quat,
     normalize,
@@ -21,12 +18,14 @@ from poise.motion.rotations import (
     quat_mul,
     quat_rotate,
     quat_to_euler,
+    quat_to_matrix,
     quat_to_rotvec,
     unwrap_quats,
 )
+from poise.motion.vectors import lower_median
 
 
-def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
+def chain_quat(angles: np.ndarray, order: str, frame: np.ndarray) -> np.ndarray:
     """Rotation `(..., 4)` of a hinge chain: `frame * R_order(angles) * frame^-1`.
 
     angles: `(..., n)` rad, outermost hinge first. order: axis letters of `frame`, "" to "ZYX".
@@ -34,7 +33,9 @@ def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
     return quat_mul(quat_mul(frame, euler_to_quat(angles, order)), quat_conj(frame))
 
 
-def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None = None) -> Tensor:
+def chain_angles(
+    rot: np.ndarray, order: str, frame: np.ndarray, prefer: np.ndarray | None = None
+) -> np.ndarray:
     """Hinge angles `(T, n)` rad of the chain that comes nearest to `rot (T, 4)`, continuous in time.
 
     Three hinges reproduce any rotation. Of the two Euler branches (a, b, c) and
@@ -45,43 +46,41 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
     """
     local = quat_mul(quat_between(frame, rot), frame)
     if not order:
-        return local.new_zeros(*local.shape[:-1], 0)
+        return np.zeros((*local.shape[:-1], 0))
     if len(order) == 1:
         axis = 1 + "XYZ".index(order)
-        raw = 2.0 * torch.atan2(local[:, axis], local[:, 0])
-        path = raw.unsqueeze(-1)
+        raw = 2.0 * np.arctan2(local[:, axis], local[:, 0])
+        path = raw[..., None]
     elif len(order) == 2:
         missing = next(c for c in "XYZ" if c not in order)
         path = quat_to_euler(local, order[0] + missing + order[1])[:, [0, 2]]
     else:
-        free = through_lock(quat_to_euler(local, order), order).numpy()
-        path = torch.tensor(
-            euler_path(free[:, None], None if prefer is None else prefer.numpy()[None])[:, 0]
-        )
-    path = torch.tensor(np.unwrap(path.numpy(), axis=0))
-    centre = torch.zeros(len(order), dtype=path.dtype) if prefer is None else prefer
-    turns = torch.round((path.median(0).values - centre) / (2 * math.pi))
+        free = through_lock(quat_to_euler(local, order), order)
+        path = euler_path(free[:, None], None if prefer is None else prefer[None])[:, 0]
+    path = np.unwrap(path, axis=0)
+    centre = np.zeros(len(order), dtype=path.dtype) if prefer is None else prefer
+    turns = np.round((lower_median(path, 0) - centre) / (2 * math.pi))
     return path - turns * 2 * math.pi
 
 
-def through_lock(angles: Tensor, order: str) -> Tensor:
+def through_lock(angles: np.ndarray, order: str) -> np.ndarray:
     """Euler angles `(T, 3)`, the third angle held through frames exactly at gimbal lock.
 
     There only the sum a +- c is known and `quat_to_euler` sets c to zero, which would be a jump.
     """
     # At b = +-90 degrees R_i(a) R_j(b) R_k(c) = R_i(a +- s c) R_j(b), s the parity of the order.
-    locked = (angles[:, 2] == 0.0) & (angles[:, 1].abs() > math.pi / 2 - 1e-6)
+    locked = (angles[:, 2] == 0.0) & (np.abs(angles[:, 1]) > math.pi / 2 - 1e-6)
     if not bool(locked.any()) or bool(locked.all()):
         return angles
-    free = (~locked).nonzero().squeeze(-1)
-    at = torch.arange(len(angles))
+    free = np.flatnonzero(~locked)
+    at = np.arange(len(angles))
     # The nearest free frame before, or the first one.
-    held = angles[free[(torch.searchsorted(free, at, right=True) - 1).clamp_min(0)], 2]
+    held = angles[free[np.maximum(np.searchsorted(free, at, side="right") - 1, 0)], 2]
     parity = 1.0 if order in ("XYZ", "YZX", "ZXY") else -1.0
-    first = angles[:, 0] - parity * angles[:, 1].sign() * held
-    out = angles.clone()
-    out[:, 0] = torch.where(locked, first, angles[:, 0])
-    out[:, 2] = torch.where(locked, held, angles[:, 2])
+    first = angles[:, 0] - parity * np.sign(angles[:, 1]) * held
+    out = angles.copy()
+    out[:, 0] = np.where(locked, first, angles[:, 0])
+    out[:, 2] = np.where(locked, held, angles[:, 2])
     return out
 
 
@@ -174,16 +173,16 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
             clip.name,
             code="skeleton-differs",
         )
-    pos, quat = skeleton.forward(*clip.tensors())
+    pos, quat = clip.world()
     pelvis = rows[0].joint
     columns = [pos[:, pelvis], unwrap_quats(quat[:, pelvis])]
     for row in rows[1:]:
         anchor = rows[row.parent].joint
         rel = quat_between(quat[:, anchor], quat[:, row.joint])
-        rest = torch.tensor(row.quat, dtype=torch.float64)
+        rest = np.asarray(row.quat, dtype=float)
         rot = quat_between(rest, rel)
-        columns.append(chain_angles(rot, row.order, torch.tensor(row.frame, dtype=torch.float64)))
-    return torch.cat(columns, -1).numpy()
+        columns.append(chain_angles(rot, row.order, np.asarray(row.frame, dtype=float)))
+    return np.concatenate(columns, -1)
 
 
 class Hinges:
@@ -226,11 +225,11 @@ class Hinges:
         """
         out = np.empty(7 + self.count)
         above, below = list(self._pelvis[:-1]), list(self._pelvis[1:])
-        out[:3] = root + q.rotate(world[above], self.skeleton.offsets[below]).sum(0)
+        out[:3] = root + quat_rotate(world[above], self.skeleton.offsets[below]).sum(0)
         out[3:7] = world[self._pelvis[-1]]
-        rel = q.between(world[self._anchors], world[self._joints])
-        local = q.mul(q.between(self._frame, q.between(self._rest, rel)), self._frame)
-        m, angles = q.matrix(local), np.zeros(self.count)
+        rel = quat_between(world[self._anchors], world[self._joints])
+        local = quat_mul(quat_between(self._frame, quat_between(self._rest, rel)), self._frame)
+        m, angles = quat_to_matrix(local), np.zeros(self.count)
         last = np.zeros(self.count) if before is None else before
         k, axis, at = self._single
         angles[at] = 2.0 * np.arctan2(local[k, 1 + axis], local[k, 0])
@@ -268,10 +267,10 @@ def qpos_to_clip(
     take their local rotation from `template` frame by frame (the clip that was imitated, same frame
     count), or identity without one.
     """
-    rows, q = table.rows, torch.tensor(np.asarray(qpos), dtype=torch.float64)
+    rows, q = table.rows, np.asarray(qpos, dtype=float)
     frames = len(q)
     if template is None:
-        rot = torch.zeros(frames, len(skeleton), 4, dtype=torch.float64)
+        rot = np.zeros((frames, len(skeleton), 4))
         rot[..., 0] = 1.0
     else:
         if template.frames != frames:
@@ -280,20 +279,20 @@ def qpos_to_clip(
                 name,
                 code="length-differs",
             )
-        rot = template.tensors()[1]
+        rot = template.rot.copy()
     pelvis = rows[0].joint
     # Joints above the pelvis keep their rotation; the pelvis' own takes up the difference.
     above = skeleton.ancestors(pelvis)[::-1]
-    world: dict[int, torch.Tensor] = {}
-    lead = torch.zeros(frames, 4, dtype=torch.float64)
+    world: dict[int, np.ndarray] = {}
+    lead = np.zeros((frames, 4))
     lead[:, 0] = 1.0
-    shift = torch.zeros(frames, 3, dtype=torch.float64)
+    shift = np.zeros((frames, 3))
     for j in above:
         if skeleton.parents[j] >= 0:
-            shift = shift + quat_rotate(lead, torch.tensor(skeleton.offsets[j]).expand(frames, 3))
+            shift = shift + quat_rotate(lead, skeleton.offsets[j])
         lead = quat_mul(lead, rot[:, j])
     if above:
-        shift = shift + quat_rotate(lead, torch.tensor(skeleton.offsets[pelvis]).expand(frames, 3))
+        shift = shift + quat_rotate(lead, skeleton.offsets[pelvis])
     root_pos = q[:, :3] - shift
     world[pelvis] = normalize(q[:, 3:7])
     rot[:, pelvis] = quat_between(lead, world[pelvis])
@@ -307,15 +306,15 @@ def qpos_to_clip(
         if j in by_joint:
             i, row = by_joint[j]
             angles = q[:, start[i] : start[i] + len(row.order)]
-            frame = torch.tensor(row.frame, dtype=torch.float64)
+            frame = np.asarray(row.frame, dtype=float)
             if row.order:
-                rest = torch.tensor(row.quat, dtype=torch.float64).expand(frames, 4)
-                turn = chain_quat(angles, row.order, frame.expand(frames, 4))
+                rest = np.asarray(row.quat, dtype=float)
+                turn = chain_quat(angles, row.order, frame)
                 anchor = world[rows[row.parent].joint]
                 full = quat_mul(anchor, quat_mul(rest, turn))
                 rot[:, j] = quat_between(world[parent], full)
         world[j] = quat_mul(world.get(parent, lead), rot[:, j])
-    return Clip(skeleton, root_pos.numpy(), normalize(rot).numpy(), fps, name)
+    return Clip(skeleton, root_pos, normalize(rot), fps, name)
 
 
 def qpos_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
@@ -324,13 +323,13 @@ def qpos_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
     Root linear velocity in the world frame (m/s), root angular velocity in the root's own frame
     (rad/s), hinge speeds (rad/s). Central differences; one-sided at both ends.
     """
-    q = torch.tensor(qpos, dtype=torch.float64)
+    q = np.asarray(qpos, dtype=float)
     frames = len(q)
-    ahead = torch.arange(frames).add(1).clamp(max=frames - 1)
-    behind = torch.arange(frames).sub(1).clamp(min=0)
-    dt = (ahead - behind).to(q.dtype).unsqueeze(-1) / fps
+    ahead = np.minimum(np.arange(frames) + 1, frames - 1)
+    behind = np.maximum(np.arange(frames) - 1, 0)
+    dt = (ahead - behind).astype(q.dtype)[..., None] / fps
     linear = (q[ahead, :3] - q[behind, :3]) / dt
     # w_b = log(q_behind^-1 q_ahead) / dt, in the root's frame
     turn = quat_to_rotvec(quat_between(q[behind, 3:7], q[ahead, 3:7])) / dt
     hinges = (q[ahead, 7:] - q[behind, 7:]) / dt
-    return torch.cat((linear, turn, hinges), -1).numpy()
+    return np.concatenate((linear, turn, hinges), -1)

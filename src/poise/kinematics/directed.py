@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError, did_you_mean
@@ -14,6 +13,7 @@ from poise.kinematics.limbs import match_positions
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import normalize, quat_conj, quat_mul, slerp
 from poise.motion.smoothing import gaussian_sums, smoothstep
+from poise.motion.vectors import lerp, lower_median, norm
 
 #: Ends of limbs that can be pinned and can touch; the pelvis, too, can be led to a point.
 LIMBS = ("left_foot", "right_foot", "left_hand", "right_hand")
@@ -79,11 +79,11 @@ def end_of(skeleton: Skeleton, limb: str) -> int:
     return joints[0]
 
 
-def ease(frames: int, first: int, last: int, fps: float, seconds: float = EASE_S) -> Tensor:
+def ease(frames: int, first: int, last: int, fps: float, seconds: float = EASE_S) -> np.ndarray:
     """`(T,)` 1 from frame `first` to `last`, rising and falling in `seconds` along a smooth step."""
-    t = torch.arange(frames, dtype=torch.float64)
-    away = torch.maximum(first - t, t - last).clamp_min(0.0) / (seconds * fps)
-    left = (1.0 - away).clamp(0.0, 1.0)
+    t = np.arange(frames, dtype=float)
+    away = np.maximum(np.maximum(first - t, t - last), 0.0) / (seconds * fps)
+    left = np.clip(1.0 - away, 0.0, 1.0)
     return smoothstep(left)
 
 
@@ -128,7 +128,7 @@ def directed(
         return clip, ()
     check_asked(clip, (*pins, *touches))
     notes: list[str] = []
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     # Limbs reach from where the pelvis is led.
     for what in (*sorted(touches, key=lambda t: t.limb != PELVIS), *pins):
         span = _span(what)
@@ -137,15 +137,15 @@ def directed(
             continue
         joint = end_of(clip.skeleton, what.limb)
         pos = _ends(clip.skeleton, root, rot, joint)
-        place = pos[span[0]] if isinstance(what, Pin) else torch.tensor(what.point).to(pos)
-        share = ease(clip.frames, *span, clip.fps).to(pos)[:, None]
-        goal = torch.lerp(pos, place.expand_as(pos), share)
+        place = pos[span[0]] if isinstance(what, Pin) else np.array(what.point)
+        share = ease(clip.frames, *span, clip.fps)[:, None]
+        goal = lerp(pos, place, share)
         still = _foot(clip.skeleton, what.limb, root, rot, joint, (span[0], span[0]))
         root, rot = _led(clip, root, rot, joint, goal)
         if isinstance(what, Pin):
             rot = _still(clip.skeleton, root, rot, still, share[:, 0])
         notes += _doubts(clip, what, pos, _ends(clip.skeleton, root, rot, joint), place)
-    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy()), tuple(notes)
+    return clip.replaced(root_pos=root, rot=rot), tuple(notes)
 
 
 def pinned(clip: Clip, pins: Sequence[Pin]) -> Clip:
@@ -153,92 +153,100 @@ def pinned(clip: Clip, pins: Sequence[Pin]) -> Clip:
 
     For a simulated motion, where friction holds a foot to within millimetres.
     """
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     for pin in pins:
         joint = end_of(clip.skeleton, pin.limb)
         pos = _ends(clip.skeleton, root, rot, joint)
         last = min(pin.last, clip.frames - 1)
-        place = pos[pin.first : last + 1].median(0).values
-        share = ease(clip.frames, pin.first, last, clip.fps).to(pos)[:, None]
-        goal = torch.lerp(pos, place.expand_as(pos), share)
+        place = lower_median(pos[pin.first : last + 1], 0)
+        share = ease(clip.frames, pin.first, last, clip.fps)[:, None]
+        goal = lerp(pos, place, share)
         still = _foot(clip.skeleton, pin.limb, root, rot, joint, (pin.first, last))
         root, rot = _led(clip, root, rot, joint, goal)
         rot = _still(clip.skeleton, root, rot, still, share[:, 0])
-    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy())
+    return clip.replaced(root_pos=root, rot=rot)
 
 
 def _foot(
-    skeleton: Skeleton, limb: str, root: Tensor, rot: Tensor, joint: int, span: tuple[int, int]
-) -> dict[int, Tensor]:
+    skeleton: Skeleton, limb: str, root: np.ndarray, rot: np.ndarray, joint: int, span: tuple[int, int]
+) -> dict[int, np.ndarray]:
     """The mean turns in the world of a foot and of all that hangs on it, over a span; none of a hand."""
     if not limb.endswith("foot"):
         return {}
     of = [joint]
     of += [j for j in range(joint + 1, len(skeleton)) if skeleton.parents[j] in of]
     world = skeleton.forward(root, rot)[1][span[0] : span[1] + 1, of]
-    sides = torch.where((world * world[:1]).sum(-1, keepdim=True) < 0, -world, world)
+    sides = np.where((world * world[:1]).sum(-1, keepdims=True) < 0, -world, world)
     return dict(zip(of, normalize(sides.mean(0)), strict=True))
 
 
 def _still(
-    skeleton: Skeleton, root: Tensor, rot: Tensor, still: dict[int, Tensor], share: Tensor
-) -> Tensor:
+    skeleton: Skeleton,
+    root: np.ndarray,
+    rot: np.ndarray,
+    still: dict[int, np.ndarray],
+    share: np.ndarray,
+) -> np.ndarray:
     """Rotations with joints turned in the world by a share `(T)` of the way to how they stay."""
-    rot, world = rot.clone(), skeleton.forward(root, rot)[1]
+    rot, world = rot.copy(), skeleton.forward(root, rot)[1]
     for j, turn in still.items():
-        wanted = slerp(world[:, j], turn.expand_as(world[:, j]), share)
+        wanted = slerp(world[:, j], turn, share)
         above = world[:, skeleton.parents[j]]
-        rot[:, j] = torch.where(share[:, None] > 0, quat_mul(quat_conj(above), wanted), rot[:, j])
-        world[:, j] = torch.where(share[:, None] > 0, wanted, world[:, j])
+        rot[:, j] = np.where(share[:, None] > 0, quat_mul(quat_conj(above), wanted), rot[:, j])
+        world[:, j] = np.where(share[:, None] > 0, wanted, world[:, j])
     return rot
 
 
-def _led(clip: Clip, root: Tensor, rot: Tensor, joint: int, goal: Tensor) -> tuple[Tensor, Tensor]:
+def _led(
+    clip: Clip, root: np.ndarray, rot: np.ndarray, joint: int, goal: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Root and rotations with the end of a limb on its goal `(T, 3)`.
 
     Where the limb is too short the whole body comes after it, smoothly and by `MOST_M` at most, with
     feet that stay where they are.
     """
-    skeleton, start, shift = clip.skeleton, rot, torch.zeros_like(root)
+    skeleton, start, shift = clip.skeleton, rot, np.zeros_like(root)
     feet = [j for j in find_anatomy(skeleton).of("foot") if j != joint]
-    goals: dict[int | str, Tensor] = {j: _ends(skeleton, root, rot, j) for j in feet}
+    goals: dict[int | str, np.ndarray] = {j: _ends(skeleton, root, rot, j) for j in feet}
     for _ in range(ROUNDS):
         kept = goals if bool(shift.any()) else {}
         rot = match_positions(skeleton, start, root + shift, {**kept, joint: goal}, soft=SOFT)
         miss = goal - _ends(skeleton, root + shift, rot, joint)
-        if float(miss.norm(dim=-1).max()) < FINE_M:
+        if float(norm(miss).max()) < FINE_M:
             break
         sums, weight, _ = gaussian_sums(miss, COME_S * clip.fps)
         shift = shift + STEP * sums / weight
-        shift = shift * (MOST_M / shift.norm(dim=-1, keepdim=True).clamp_min(MOST_M))
-    moved = (rot - start).abs().amax((1, 2)) > 0
-    touched = moved & ((goal - _ends(skeleton, root, start, joint)).norm(dim=-1) > 0) | shift.any(-1)
-    return root + shift, torch.where(touched[:, None, None], rot, start)
+        shift = shift * (MOST_M / np.maximum(norm(shift, keepdims=True), MOST_M))
+    moved = np.abs(rot - start).max((1, 2)) > 0
+    touched = moved & (norm(goal - _ends(skeleton, root, start, joint)) > 0) | shift.any(-1)
+    return root + shift, np.where(touched[:, None, None], rot, start)
 
 
-def _pelvis_led(clip: Clip, root: Tensor, rot: Tensor, what: TouchPoint) -> tuple[Tensor, Tensor]:
+def _pelvis_led(
+    clip: Clip, root: np.ndarray, rot: np.ndarray, what: TouchPoint
+) -> tuple[np.ndarray, np.ndarray]:
     """Root and rotations with the root at a point in one frame, and feet where they are as far as legs
     reach."""
     skeleton = clip.skeleton
-    feet: dict[int | str, Tensor] = {
+    feet: dict[int | str, np.ndarray] = {
         j: _ends(skeleton, root, rot, j) for j in find_anatomy(skeleton).of("foot")
     }
-    share = ease(clip.frames, what.frame, what.frame, clip.fps, PELVIS_S).to(root)[:, None]
-    moved = root + share * (torch.tensor(what.point).to(root) - root[what.frame])
+    share = ease(clip.frames, what.frame, what.frame, clip.fps, PELVIS_S)[:, None]
+    moved = root + share * (np.array(what.point) - root[what.frame])
     led = match_positions(skeleton, rot, moved, feet, soft=SOFT)
-    return moved, torch.where((share > 0)[:, None], led, rot)
+    return moved, np.where((share > 0)[:, None], led, rot)
 
 
-def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:
+def _ends(skeleton: Skeleton, root: np.ndarray, rot: np.ndarray, joint: int) -> np.ndarray:
     return skeleton.forward(root, rot)[0][:, joint]
 
 
 def _doubts(
-    clip: Clip, what: Pin | TouchPoint, before: Tensor, after: Tensor, place: Tensor
+    clip: Clip, what: Pin | TouchPoint, before: np.ndarray, after: np.ndarray, place: np.ndarray
 ) -> list[str]:
     """What a director should know of a pin or a touch."""
     span = (what.first, what.last) if isinstance(what, Pin) else (what.frame, what.frame)
-    short = (after[span[0] : span[1] + 1] - place).norm(dim=-1)
+    short = norm(after[span[0] : span[1] + 1] - place)
     said: list[str] = []
     if float(short.max()) > SHORT_M:
         k = span[0] + int(short.argmax())

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kinematics.forward import centre_of_mass
@@ -65,12 +64,12 @@ class RequiredWrench:
         return float(left), forces
 
 
-def asked(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> RequiredWrench:
+def asked(table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float) -> RequiredWrench:
     """What a motion asks of the world; `pos`, `quat`: `(T, B, 3)` m and `(T, B, 4)`, places of its
     rows."""
     mass = np.array([r.mass for r in table.rows])
-    com = _smooth(centre_of_mass(table, pos, quat).numpy(), fps)
-    parts = _smooth(pos.numpy().reshape(len(pos), -1), fps).reshape(pos.shape)
+    com = _smooth(centre_of_mass(table, pos, quat), fps)
+    parts = _smooth(pos.reshape(len(pos), -1), fps).reshape(pos.shape)
     rate = np.gradient(parts, axis=0) * fps
     speed = np.gradient(com, axis=0) * fps
     spin = (np.cross(parts - com[:, None], rate - speed[:, None]) * mass[:, None]).sum(1)
@@ -112,7 +111,7 @@ BESIDE_M = 0.6
 
 
 def find_supports(
-    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, rules: AloneRules | None = None
+    table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float, rules: AloneRules | None = None
 ) -> tuple[Support, ...]:
     """What a motion, standing on z = 0, rests on besides its floor; in order of time.
 
@@ -125,7 +124,7 @@ def find_supports(
     Args:
         table: the body. pos, quat: `(T, B, 3)` m and `(T, B, 4)` wxyz, places of its rows.
     """
-    pos, quat = pos.double(), quat.double()
+    pos, quat = pos.astype(float), quat.astype(float)
     spells = beyond_a_floor(table, pos, quat, fps, rules or RULES)
     spells = [s for s in spells if s.kind != "below"]
     if not spells:
@@ -157,7 +156,7 @@ def _borne(
 ) -> list[tuple[Candidate, float]]:
     """What bears a spell, with the greatest force on each; nothing where it stays unborne."""
     first, last = spell
-    frames = np.unique(np.linspace(first, last, min(FRAMES, last - first + 1)).round().astype(int))
+    frames = np.unique(np.round(np.linspace(first, last, min(FRAMES, last - first + 1))).astype(int))
     dt = (last - first + 1) / solid.fps / len(frames)
     tried, chosen = solid.candidates(first, last), list[Candidate]()
     left = _missing(frames, chosen, solid, wanted)

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
 from poise.body.body_table import BodyRow
@@ -167,18 +166,18 @@ def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
 
     An order is changed only where the motion comes nearer than `GIMBAL` to the lock.
     """
-    worlds = [torch.tensor(c.world()[1]) for c in clips]
+    worlds = [c.world()[1] for c in clips]
     rows = list(table.rows)
     for i, row in enumerate(rows):
         if len(row.order) != 3:
             continue
         anchor = rows[row.parent].joint
-        rest = torch.tensor(row.quat, dtype=torch.float64)
-        frame = torch.tensor(row.frame, dtype=torch.float64)
-        rel = torch.cat([quat_between(w[:, anchor], w[:, row.joint]) for w in worlds])
+        rest = np.asarray(row.quat, dtype=float)
+        frame = np.asarray(row.frame, dtype=float)
+        rel = np.concatenate([quat_between(w[:, anchor], w[:, row.joint]) for w in worlds])
         turns = quat_mul(quat_between(quat_mul(rest, frame), rel), frame)
         orders = [row.order, *("".join(p) for p in itertools.permutations("XYZ"))]
-        reach = [float(quat_to_euler(turns, o)[:, 1].abs().max()) for o in orders]
+        reach = [float(np.abs(quat_to_euler(turns, o)[:, 1]).max()) for o in orders]
         if reach[0] > GIMBAL:
             order = orders[int(np.argmin(np.round(reach, 2)))]
             # An axis keeps its limits when its place in the chain changes.

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kinematics.feet import stance_heights
@@ -89,7 +87,7 @@ def fit_ground(
     smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed. A floor that is
     `known` to be at z = 0 needs no constant lift.
     """
-    state = Kinematics(table)(torch.tensor(qpos))
+    state = Kinematics(table)(qpos)
     fit = fit_heights(table, state.pos, state.quat, fps, cyclic, sink_m, known)
     out = np.array(qpos)
     out[:, 2] += fit.lift_m - fit.settle_m + fit.clear_m
@@ -98,8 +96,8 @@ def fit_ground(
 
 def fit_heights(
     table: BodyTable,
-    pos: Tensor,
-    quat: Tensor,
+    pos: np.ndarray,
+    quat: np.ndarray,
     fps: float,
     cyclic: bool = False,
     sink_m: float = SINK_M,

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kinematics.feet import Sole, bearing, dragged, soles_of
@@ -34,6 +32,7 @@ from poise.motion.rotations import (
     quat_mul,
 )
 from poise.motion.smoothing import gaussian, smooth_lift
+from poise.motion.vectors import cross
 
 #: A (s) and B (1/s) of `lead`.
 SMOOTH_S, RETURN_PER_S = 0.006, 0.6
@@ -48,11 +47,11 @@ class Lead(NamedTuple):
     `(T)` rad that raises its toe, about `axis (T, 3)`, which is level, and roll `(T)` rad about the line
     of the sole, None without any."""
 
-    shift: Tensor
-    turn: Tensor
-    tilt: Tensor
-    axis: Tensor
-    roll: Tensor | None = None
+    shift: np.ndarray
+    turn: np.ndarray
+    tilt: np.ndarray
+    axis: np.ndarray
+    roll: np.ndarray | None = None
 
 
 def lead(
@@ -82,7 +81,7 @@ def lead(
         flat: `(T - 1)`, how much the ankle stays as well, above the sole, by a roll of the foot.
     """
     fixed = np.zeros(len(sole.ankle), dtype=bool) if fixed is None else fixed
-    ends, ankle = sole.ends.numpy(), sole.ankle.numpy()
+    ends, ankle = sole.ends, sole.ankle
     velocity = np.diff(ends, axis=0) * fps
     length = float(np.linalg.norm(ends[0, 1] - ends[0, 0]))
     arm = (ends - ankle[:, None]) / length
@@ -117,33 +116,33 @@ def lead(
     shift = np.concatenate((level[:, :2], up[:, :1]), -1)
     axis = np.stack((way[:, 1], -way[:, 0], np.zeros(len(way))), -1)
     turns = (level[:, 2] / length, up[:, 1] / length, axis, *(level[:, 3:] / length).T)
-    return Lead(*(torch.tensor(x) for x in (shift, *turns)))
+    return Lead(shift, *turns)
 
 
-def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]) -> Tensor:
+def led(skeleton: Skeleton, rot: np.ndarray, root: np.ndarray, leads: Mapping[int, Lead]) -> np.ndarray:
     """The motion `(T, J, 4)` with the feet (by joint) led, their legs bent to follow, all else kept."""
     pos, quat = skeleton.forward(root, rot)
-    goals: dict[int | str, Tensor] = {j: pos[:, j] + one.shift for j, one in leads.items()}
-    touched = torch.zeros(len(rot), dtype=torch.bool)
+    goals: dict[int | str, np.ndarray] = {j: pos[:, j] + one.shift for j, one in leads.items()}
+    touched = np.zeros(len(rot), dtype=bool)
     for one in leads.values():
         touched |= one.shift.any(-1) | (one.turn != 0) | (one.tilt != 0)
         if one.roll is not None:
             touched |= one.roll != 0
     out = match_positions(skeleton, rot, root, goals, soft=SOFT)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=rot.dtype)
+    up = np.array([0.0, 0.0, 1.0], dtype=rot.dtype)
     for joint, one in leads.items():
         # The foot keeps its turn in the world, so its own turn is that of the world seen from it.
         own = quat[:, joint]
-        tilt = axis_angle_to_quat(one.axis.to(own.dtype), one.tilt)
+        tilt = axis_angle_to_quat(one.axis, one.tilt)
         about = quat_mul(axis_angle_to_quat(up, one.turn), tilt)
         if one.roll is not None:
-            line = torch.linalg.cross(up.expand_as(one.axis), one.axis.to(own.dtype), dim=-1)
+            line = cross(up, one.axis)
             about = quat_mul(about, axis_angle_to_quat(line, one.roll))
         out[:, joint] = quat_mul(out[:, joint], quat_between(own, quat_mul(about, own)))
-    kept = torch.ones(rot.shape[:2], dtype=torch.bool)
+    kept = np.ones(rot.shape[:2], dtype=bool)
     for joint in leads:
         kept[:, list(limb_of(skeleton, joint))] = ~touched[:, None]
-    return torch.where(kept[..., None], rot, out)
+    return np.where(kept[..., None], rot, out)
 
 
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -206,21 +205,21 @@ class StandingFoot(NamedTuple):
     """
 
     sole: Sole
-    weight: Tensor
-    lift: Tensor | None = None
-    flat: Tensor | None = None
+    weight: np.ndarray
+    lift: np.ndarray | None = None
+    flat: np.ndarray | None = None
 
 
 def hold(
     skeleton: Skeleton,
-    root: Tensor,
-    rot: Tensor,
+    root: np.ndarray,
+    rot: np.ndarray,
     fps: float,
-    standing: Callable[[Tensor, Tensor], Mapping[int, StandingFoot]],
-    fixed: Tensor | None = None,
+    standing: Callable[[np.ndarray, np.ndarray], Mapping[int, StandingFoot]],
+    fixed: np.ndarray | None = None,
     vertical: float = 0.0,
     rounds: int = HOLD_ROUNDS,
-) -> Tensor:
+) -> np.ndarray:
     """Rotations `(T, J, 4)` wxyz with the feet held where they stand; all but the legs stays as it is.
 
     Args:
@@ -229,12 +228,10 @@ def hold(
         fixed: `(T)` bool, frames that stay as they are.
         vertical: the heights of the soles' ends are held as well, with this share of their weight.
     """
-    pinned = None if fixed is None else fixed.numpy()
     for _ in range(rounds):
         leads = {}
         for foot, one in standing(*skeleton.forward(root, rot)).items():
-            flat = None if one.flat is None else one.flat.numpy()
-            leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical, flat)
+            leads[foot] = lead(one.sole, one.weight, fps, fixed, vertical, one.flat)
             if one.lift is not None:
                 leads[foot].shift[:, 2] += one.lift
         rot = led(skeleton, rot, root, leads) if leads else rot
@@ -265,7 +262,7 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, HoldReport]:
         return clip, HoldReport(0.0, 0.0)
     rows, bears, left = [r.joint for r in table.rows], dict[int, np.ndarray](), set[int]()
 
-    def standing(pos: Tensor, quat: Tensor) -> dict[int, StandingFoot]:
+    def standing(pos: np.ndarray, quat: np.ndarray) -> dict[int, StandingFoot]:
         pos, quat = pos[:, rows], quat[:, rows]
         soles, low, out = soles_of(table, pos, quat), lowest_height(table, pos, quat), {}
         weights = bearing([sole.ends for sole in soles.values()], clip.fps)
@@ -273,20 +270,20 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, HoldReport]:
             if rows[row] in left:
                 continue
             weight = weight * ~dragged(sole, weight, clip.fps)[:, None]
-            deep = (-low[:, row]).clamp_min(0.0).numpy()
-            lift = torch.tensor(smooth_lift(deep, clip.fps, LIFT_S)) if deep.any() else None
+            deep = np.maximum(-low[:, row], 0.0)
+            lift = smooth_lift(deep, clip.fps, LIFT_S) if deep.any() else None
             out[rows[row]] = StandingFoot(sole, weight, lift)
-            steps = (weight.amax(-1) > 0).numpy()
+            steps = weight.max(-1) > 0
             bears[rows[row]] = np.append(steps, steps[-1])
         return out
 
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     out = hold(clip.skeleton, root, rot, clip.fps, standing)
     while fast := _too_fast(clip.skeleton, rot, out, clip.fps, bears):
         left |= fast
         bears.clear()
         out = hold(clip.skeleton, root, rot, clip.fps, standing)
-    held = clip.replaced(rot=out.numpy()) if bears else clip
+    held = clip.replaced(rot=out) if bears else clip
     moved = np.linalg.norm(held.positions() - clip.positions(), axis=-1) * 1000
     borne = np.concatenate([moved[when, foot] for foot, when in bears.items()] or [np.zeros(0)])
     most = max((float(moved[:, foot].max()) for foot in bears), default=0.0)
@@ -295,11 +292,11 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, HoldReport]:
 
 
 def _too_fast(
-    skeleton: Skeleton, before: Tensor, after: Tensor, fps: float, feet: Iterable[int]
+    skeleton: Skeleton, before: np.ndarray, after: np.ndarray, fps: float, feet: Iterable[int]
 ) -> set[int]:
     """Feet with a leg of which a joint turns faster than joints do since it is led."""
-    moved = (before != after).flatten(2).any(-1).any(0)
-    fastest = [fps * quat_distance(x[:-1], x[1:]).amax(0) for x in (before, after)]
+    moved = (before != after).any((0, 2))
+    fastest = [fps * quat_distance(x[:-1], x[1:]).max(0) for x in (before, after)]
     out = set[int]()
     for foot in feet:
         leg = [j for j in (foot, *skeleton.ancestors(foot)) if moved[j]]
@@ -354,22 +351,22 @@ def mend_slides(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
     contact, weights = contact & (speed <= SWING_SPEED), {}
     for foot in dict.fromkeys(support.feet):
         mine = [k for k, joint in enumerate(support.feet) if joint == foot]
-        slides = torch.zeros(clip.frames - 1, 1, dtype=torch.bool)
+        slides = np.zeros((clip.frames - 1, 1), dtype=bool)
         for fault in faults:
             if fault.joint == clip.skeleton.names[foot]:
                 slides[fault.start : fault.stop] = True
         if bool(slides.any()):
-            weights[foot] = mine, (contact[:, mine] & slides).double() * FIRM
+            weights[foot] = mine, (contact[:, mine] & slides).astype(float) * FIRM
 
-    def standing(pos: Tensor, _: Tensor) -> dict[int, StandingFoot]:
+    def standing(pos: np.ndarray, _: np.ndarray) -> dict[int, StandingFoot]:
         return {
             foot: StandingFoot(Sole(pos[:, foot], support.soles[:, mine]), weight)
             for foot, (mine, weight) in weights.items()
         }
 
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     out = hold(clip.skeleton, root, rot, clip.fps, standing, rounds=1)
-    return clip.replaced(rot=out.numpy())
+    return clip.replaced(rot=out)
 
 
 #: How surely an end stands that bears: the power of its probability.
@@ -389,21 +386,21 @@ def steadied(clip: Clip, support: FloorPoints) -> Clip:
     stands, level, rise = stance(support)
     firm, upright = (float(_firm(s / q)) for s, q in ((level, LEVEL_SPEED), (rise, RISE_SPEED)))
     rolls = np.maximum(ROLLS_S * support.fps / lasting(stands), 1.0)
-    weight = torch.tensor(_firm(level / (LEVEL_SPEED * rolls)) * stands**SURE)
+    weight = _firm(level / (LEVEL_SPEED * rolls)) * stands**SURE
     if firm <= 0.0 or not bool(weight.any()):
         return clip
 
-    def standing(pos: Tensor, _: Tensor) -> dict[int, StandingFoot]:
+    def standing(pos: np.ndarray, _: np.ndarray) -> dict[int, StandingFoot]:
         out = dict[int, StandingFoot]()
         for foot in dict.fromkeys(support.feet):
             mine = [k for k, joint in enumerate(support.feet) if joint == foot]
             sole, own = Sole(pos[:, foot], support.soles[:, mine]), weight[:, mine]
-            out[foot] = StandingFoot(sole, own, flat=own.amin(-1))
+            out[foot] = StandingFoot(sole, own, flat=own.min(-1))
         return out
 
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     out = hold(clip.skeleton, root, rot, clip.fps, standing, vertical=upright / firm, rounds=1)
-    return clip.replaced(rot=out.numpy())
+    return clip.replaced(rot=out)
 
 
 def _firm(share: float | np.ndarray) -> np.ndarray:

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import Humanoid, make_spec
 from poise.errors import PoiseError, did_you_mean
-from poise.kinematics.ik_body import IkBody, arc, rotate
+from poise.kinematics.ik_bodies import IkBody, arc, rotate
 from poise.kinematics.ik_frames import (
     BodyFrames,
     IkConfig,
@@ -71,7 +69,7 @@ def clip_ik(clip: Clip, body: Humanoid | IkBody, config: IkConfig | None = None)
 
 def _gather(
     positions: np.ndarray, body: IkBody, names: Sequence[str] | None, rotations: np.ndarray | None
-) -> tuple[Tensor, Tensor | None]:
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Positions `(T, P, 3)` in the body's order (NaN for toes that are not given), rotations alike."""
     rows = len(body.table.rows)
     if positions.ndim != 3 or positions.shape[-1] != 3 or not len(positions):
@@ -98,19 +96,19 @@ def _gather(
         frame = int(np.argwhere(bad)[0][0])
         raise PoiseError(f"a joint position is not finite at frame {frame}", code="not-finite")
     if rotations is None:
-        return torch.tensor(points), None
-    turns = torch.tensor(np.asarray(rotations, dtype=np.float64)[:, at[:rows]])
-    return torch.tensor(points), quat_to_matrix(turns)
+        return points, None
+    turns = np.asarray(rotations, dtype=np.float64)[:, at[:rows]]
+    return points, quat_to_matrix(turns)
 
 
 def _rotations(
-    points: Tensor, body: IkBody, config: IkConfig, turns: Tensor | None
-) -> dict[int, Tensor]:
+    points: np.ndarray, body: IkBody, config: IkConfig, turns: np.ndarray | None
+) -> dict[int, np.ndarray]:
     """World rotations `(T, 3, 3)` of the rows that positions tell something about."""
     frames, rest = BodyFrames(points, body, config), rest_frames(body, config)
     if not config.square:
         return _paper_rotations(frames, rest, body)
-    out: dict[int, Tensor] = {}
+    out: dict[int, np.ndarray] = {}
     for row, frame in frames.frames.items():
         # F = B A with A fixed in the body: B = F F_rest^T B_rest
         fixed = rest.frames[row][0].T @ body.rest_rot[row]
@@ -123,7 +121,7 @@ def _rotations(
     return out
 
 
-def _paper_rotations(frames: BodyFrames, rest: BodyFrames, body: IkBody) -> dict[int, Tensor]:
+def _paper_rotations(frames: BodyFrames, rest: BodyFrames, body: IkBody) -> dict[int, np.ndarray]:
     """The same through Eq. 6 from parent to child, whatever it makes of frames that are not square."""
     rows = body.table.rows
     out = {0: frames.frames[0] @ rest.frames[0][0].T @ body.rest_rot[0]}
@@ -135,7 +133,7 @@ def _paper_rotations(frames: BodyFrames, rest: BodyFrames, body: IkBody) -> dict
         while p not in out:
             p = rows[p].parent
         both = [(f.knee_parent.get(row, f.frames[p]), f.frames[row]) for f in (frames, rest)]
-        turn, still = (torch.tensor(zyx_matrix(zyx_angles(a.numpy(), b.numpy()))) for a, b in both)
+        turn, still = (zyx_matrix(zyx_angles(a, b)) for a, b in both)
         # B_c = B_p A_p M A_c^T, with A_c such that the rest pose comes out at rest.
         fixed[row] = body.rest_rot[row].T @ body.rest_rot[p] @ fixed[p] @ still[0]
         out[row] = out[p] @ fixed[p] @ turn @ fixed[row].T
@@ -153,12 +151,12 @@ def _tip(body: IkBody, row: int) -> int:
 
 
 def _coordinates(
-    points: Tensor, wanted: dict[int, Tensor], body: IkBody, config: IkConfig
+    points: np.ndarray, wanted: dict[int, np.ndarray], body: IkBody, config: IkConfig
 ) -> np.ndarray:
     """qpos from world rotations: three hinges make any rotation, fewer point their bone."""
     rows = body.table.rows
     angles: dict[int, np.ndarray] = {}
-    world: list[Tensor] = [wanted[0]]
+    world: list[np.ndarray] = [wanted[0]]
     free: list[int] = []
     for i, row in enumerate(rows[1:], 1):
         if len(row.order) == 3 and i in wanted:
@@ -167,7 +165,7 @@ def _coordinates(
             continue
         zero = world[row.parent] @ body.links[i]
         tip = _tip(body, i)
-        if not row.order or tip < 0 or bool(points[0, tip, 0].isnan()):
+        if not row.order or tip < 0 or bool(np.isnan(points[0, tip, 0])):
             angles[i] = np.zeros((len(points), len(row.order)))
             world.append(zero)
             continue
@@ -179,25 +177,25 @@ def _coordinates(
             world.append(arc(rotate(zero, bone), along) @ zero)
         else:
             seen, axes = rotate(zero.mT, along), body.axes[i]
-            angles[i] = pointing_angles(bone.numpy(), seen.numpy(), row.order, axes.numpy())
-            turn = quat_to_matrix(euler_to_quat(torch.tensor(angles[i]), row.order))
+            angles[i] = pointing_angles(bone, seen, row.order, axes)
+            turn = quat_to_matrix(euler_to_quat(angles[i], row.order))
             world.append(zero @ axes @ turn @ axes.T)
-    angles.update(_free_angles(free, torch.stack(world, 1), body, config))
+    angles.update(_free_angles(free, np.stack(world, 1), body, config))
     hinges = np.concatenate([angles[i] for i in sorted(angles)], -1)
     hinges = unwrapped(hinges) if config.on("branches") else hinges
-    root = unwrap_quats(matrix_to_quat(world[0])).numpy()
-    return np.concatenate((points[:, 0].numpy(), root, hinges), -1)
+    root = unwrap_quats(matrix_to_quat(world[0]))
+    return np.concatenate((points[:, 0], root, hinges), -1)
 
 
 def _free_angles(
-    free: list[int], world: Tensor, body: IkBody, config: IkConfig
+    free: list[int], world: np.ndarray, body: IkBody, config: IkConfig
 ) -> dict[int, np.ndarray]:
     """Angles `(T, 3)` of rows with three hinges from all world rotations `(T, R, 3, 3)`."""
     parents = [body.table.rows[i].parent for i in free]
     zero = world[:, parents] @ body.links[free]
     axes = body.axes[free]
     # The chain's rotation (B_parent link)^T B, stated in the hinges' own frame.
-    local = (axes.mT @ (zero.mT @ world[:, free]) @ axes).numpy()
+    local = axes.mT @ (zero.mT @ world[:, free]) @ axes
     out: dict[int, np.ndarray] = {}
     orders = [body.table.rows[i].order for i in free]
     for order in dict.fromkeys(orders):

@@ -8,12 +8,11 @@ from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.kinematics.coords import best_path, euler_path, through_lock, wrapped
-from poise.kinematics.ik_body import IkBody, bend_normals, frame_of, held_normals, square_to
+from poise.kinematics.ik_bodies import IkBody, bend_normals, frame_of, held_normals, square_to
 from poise.motion.rotations import best_rotation, normalize
+from poise.motion.vectors import cross, norm
 from poise.settings import Checked, Positive, Range
 
 #: Every correction with what is wrong in the paper. Two more need no switch: the doubled symbols in the
@@ -69,17 +68,17 @@ class BodyFrames:
     knee_parent: rows of shins for which the paper states the parent's frame otherwise (Eq. 20).
     """
 
-    def __init__(self, p: Tensor, body: IkBody, config: IkConfig, at_rest: bool = False):
+    def __init__(self, p: np.ndarray, body: IkBody, config: IkConfig, at_rest: bool = False):
         self.p, self.body, self.config, self.at_rest = p, body, config, at_rest
-        self.frames: dict[int, Tensor] = {}
-        self.knee_parent: dict[int, Tensor] = {}
+        self.frames: dict[int, np.ndarray] = {}
+        self.knee_parent: dict[int, np.ndarray] = {}
         self._trunk()
         self._spine()
         self._collarbones()
         self._limbs()
         self._feet()
 
-    def _l(self, a: str, b: str) -> Tensor:
+    def _l(self, a: str, b: str) -> np.ndarray:
         """The vector from joint a to joint b, `(T, 3)` m."""
         return self.p[:, self.body.roles[b]] - self.p[:, self.body.roles[a]]
 
@@ -92,22 +91,22 @@ class BodyFrames:
                 self.frames[row] = self._fitted(row)
             return
         # Eq. 18: x = l_rhip-lhip, y = l_root-rhip x l_root-lhip, z = x x y
-        x, y = bone("rhip", "lhip"), torch.linalg.cross(bone("root", "rhip"), bone("root", "lhip"))
+        x, y = bone("rhip", "lhip"), cross(bone("root", "rhip"), bone("root", "lhip"))
         self.frames[0] = frame_of("x", x=x, y=y)
         if top == 0:
             return
         # Eq. 16: x = l_rcl-lcl, z = l_lowneck-lcl x l_lowneck-rcl, y = z x x
-        x, z = bone("rcl", "lcl"), torch.linalg.cross(bone("lowneck", "lcl"), bone("lowneck", "rcl"))
+        x, z = bone("rcl", "lcl"), cross(bone("lowneck", "lcl"), bone("lowneck", "rcl"))
         self.frames[top] = frame_of("x", x=x, z=z)
 
-    def _fitted(self, row: int) -> Tensor:
+    def _fitted(self, row: int) -> np.ndarray:
         """The trunk's frame carried by the rotation that fits all points rigidly attached to `row`."""
         body = self.body
         at = list(body.clusters[row])
         here = body.rest_pos[at] - body.rest_pos[at[0]]
         there = self.p[:, at] - self.p[:, at[:1]]
         # M = sum there here^T
-        return best_rotation(torch.einsum("tki,kj->tij", there, here))[0] @ body.trunk
+        return best_rotation(np.einsum("tki,kj->tij", there, here))[0] @ body.trunk
 
     def _spine(self) -> None:
         """Eqs. 17 and 18: the rows between the pelvis and the lower neck."""
@@ -117,7 +116,7 @@ class BodyFrames:
         for i in range(1, len(chain) - 1):
             along = p[:, chain[i + 1]] - p[:, chain[i]]
             below = p[:, chain[i - 1]] - p[:, chain[i]]
-            y = normalize(torch.where(along.norm(dim=-1, keepdim=True) < 1e-6, low[..., 1], along))
+            y = normalize(np.where(norm(along, keepdims=True) < 1e-6, low[..., 1], along))
             if self.config.on("spine_twist"):
                 # The twist goes evenly from the pelvis' x to the shoulders'.
                 share = i / (len(chain) - 1)
@@ -126,7 +125,7 @@ class BodyFrames:
                 )
             else:
                 # Eq. 17: y = l_th-lowneck, x = y x l_th-mspine, z = x x y
-                x = normalize(torch.linalg.cross(y, below))
+                x = normalize(cross(y, below))
                 self.frames[chain[i]] = frame_of("y", x=x, y=y)
 
     def _collarbones(self) -> None:
@@ -137,21 +136,21 @@ class BodyFrames:
             if row != roles[f"{side}s"] and self.body.table.rows[row].order:
                 # Eq. 12: x_c = l_lcl-ls, z_c = l_lcl-mspine x x_c, y_c = z_c x x_c
                 x = normalize(self._l(a, b))
-                z = torch.linalg.cross(self._l(f"{side}cl", "mspine"), x)
+                z = cross(self._l(f"{side}cl", "mspine"), x)
                 self.frames[row] = frame_of("x", x=x, z=z)
 
     def _limbs(self) -> None:
         """Eqs. 10, 11, 13, 14 (arms) and 19, 20, 22, 23 (legs)."""
         p, body, config = self.p, self.body, self.config
-        upper = normalize(torch.stack([p[:, a.lower] - p[:, a.upper] for a in body.arms], 1))
-        lower = normalize(torch.stack([p[:, a.end] - p[:, a.lower] for a in body.arms], 1))
+        upper = normalize(np.stack([p[:, a.lower] - p[:, a.upper] for a in body.arms], 1))
+        lower = normalize(np.stack([p[:, a.end] - p[:, a.lower] for a in body.arms], 1))
         normals = self._normals(upper, lower)
         arms = [k for k, a in enumerate(body.arms) if not a.leg]
         legs = [k for k, a in enumerate(body.arms) if a.leg]
-        both, twice = torch.cat((upper, lower), 1), torch.cat((normals, normals), 1)
+        both, twice = np.concatenate((upper, lower), 1), np.concatenate((normals, normals), 1)
         # Eq. 10: x = l_ls-le and l_le-lw, z = -l_ls-le x l_le-lw. Eq. 13: x = l_re-rs and l_rw-re,
         # z = l_re-rw x l_re-rs. So x points outward on the left and inward on the right.
-        way = p.new_tensor([[1.0] if body.arms[k].left else [-1.0] for k in arms * 2])
+        way = np.array([[1.0] if body.arms[k].left else [-1.0] for k in arms * 2])
         at = arms + [k + len(body.arms) for k in arms]
         self._put(arms, frame_of("x", x=way * both[:, at], z=-way * twice[:, at]))
         if config.on("thigh_twist"):
@@ -165,31 +164,31 @@ class BodyFrames:
                 arm.upper, arm.lower, arm.left, upper[:, k], lower[:, k], normals[:, k]
             )
 
-    def _put(self, arms: list[int], frames: Tensor) -> None:
+    def _put(self, arms: list[int], frames: np.ndarray) -> None:
         """Gives `frames (T, 2 n, 3, 3)` to the upper bones of n limbs, then to their lower bones."""
         rows = [self.body.arms[k].upper for k in arms] + [self.body.arms[k].lower for k in arms]
         self.frames.update({row: frames[:, i] for i, row in enumerate(rows)})
 
     def _leg_of_hip_line(
-        self, thigh: int, shin: int, left: bool, u: Tensor, v: Tensor, n: Tensor
+        self, thigh: int, shin: int, left: bool, u: np.ndarray, v: np.ndarray, n: np.ndarray
     ) -> None:
         """Eqs. 19 and 20 (left), 22 and 23 (right): the thigh's twist from the line of the hips."""
         y_p, y_c = -u, -v
         # Eq. 19: z = l_lhip-rhip x -y. Eq. 22: z = -y x l_rhip-lhip. Both point forward.
         hips = self._l("lhip", "rhip")
-        z = normalize(torch.linalg.cross(hips, -y_p))
-        self.frames[thigh] = torch.stack((torch.linalg.cross(y_p, z), y_p, z), -1)
+        z = normalize(cross(hips, -y_p))
+        self.frames[thigh] = np.stack((cross(y_p, z), y_p, z), -1)
         # Eq. 20: x_c = -y_c x l_lk-lhip, z_c = x_c x y_c
         x = square_to(n, y_c) if self.config.on("hold_bend") or self.at_rest else n
         x = normalize(x)
-        z_c = torch.linalg.cross(x, y_c)
-        self.frames[shin] = torch.stack((x, y_c, z_c), -1)
+        z_c = cross(x, y_c)
+        self.frames[shin] = np.stack((x, y_c, z_c), -1)
         if left and not self.config.on("knee_subscripts"):
             # Eq. 20 as printed builds the parent from the child's y_c and z_c.
-            x, z = torch.linalg.cross(y_c, z_c), torch.linalg.cross(hips, -y_c)
-            self.knee_parent[shin] = torch.stack((normalize(x), y_p, normalize(z)), -1)
+            x, z = cross(y_c, z_c), cross(hips, -y_c)
+            self.knee_parent[shin] = np.stack((normalize(x), y_p, normalize(z)), -1)
 
-    def _normals(self, upper: Tensor, lower: Tensor) -> Tensor:
+    def _normals(self, upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
         """Unit bend axes `(T, 4, 3)` of the limbs."""
         body, config = self.body, self.config
         if self.at_rest:
@@ -208,8 +207,8 @@ class BodyFrames:
         return held_normals(
             upper,
             lower,
-            torch.stack(parents, 1),
-            torch.stack(bones),
+            np.stack(parents, 1),
+            np.stack(bones),
             body.normals,
             config.straight,
             config.hold_frames,
@@ -235,7 +234,7 @@ class BodyFrames:
                 self.frames[ankle] = frame_of("z", x=shin[..., 0], z=z)
             else:
                 # x_c = y_c x z_c, with a shin y_c that is not square to z_c.
-                self.frames[ankle] = torch.stack((normalize(torch.linalg.cross(y, z)), y, z), -1)
+                self.frames[ankle] = np.stack((normalize(cross(y, z)), y, z), -1)
 
 
 @lru_cache(maxsize=32)
@@ -297,7 +296,7 @@ def continuous_euler(m: np.ndarray, order: str, branches: bool = True) -> np.nda
     if not branches:
         return one_turn_check(angles)
     for r in np.flatnonzero((np.abs(angles[..., 1]) > math.pi / 2 - 1e-6).any(0)):
-        angles[:, r] = through_lock(torch.tensor(angles[:, r]), order).numpy()
+        angles[:, r] = through_lock(angles[:, r], order)
     return euler_path(angles)
 
 

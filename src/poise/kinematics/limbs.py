@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError
@@ -24,6 +22,7 @@ from poise.motion.rotations import (
     shortest_arc,
 )
 from poise.motion.smoothing import find_runs, smoothstep
+from poise.motion.vectors import cross, norm
 
 #: The share of a limb's length over which it slows down before it is straight.
 SOFT = 0.02
@@ -44,7 +43,7 @@ class Limb(NamedTuple):
     end: int
 
 
-def soft_reach(distance: Tensor, l1: Tensor, l2: Tensor, soft: float = SOFT) -> Tensor:
+def soft_reach(distance: np.ndarray, l1: np.ndarray, l2: np.ndarray, soft: float = SOFT) -> np.ndarray:
     """The distance `(...)` m that a limb spans when it is asked for `distance`.
 
     Up to L (1 - soft), with L = l1 + l2, it is the distance itself; beyond, it nears L exponentially, so
@@ -52,9 +51,9 @@ def soft_reach(distance: Tensor, l1: Tensor, l2: Tensor, soft: float = SOFT) -> 
     at L. Never nearer than |l1 - l2|.
     """
     length = l1 + l2
-    s = (soft * length).clamp_min(1e-12)
-    eased = length - s * torch.exp(-((distance - length + s) / s).clamp_min(0.0))
-    return torch.maximum(torch.where(distance > length - s, eased, distance), (l1 - l2).abs())
+    s = np.maximum(soft * length, 1e-12)
+    eased = length - s * np.exp(-np.maximum((distance - length + s) / s, 0.0))
+    return np.maximum(np.where(distance > length - s, eased, distance), np.abs(l1 - l2))
 
 
 def limb_of(skeleton: Skeleton, joint: int | str) -> Limb:
@@ -89,12 +88,12 @@ def limb_of(skeleton: Skeleton, joint: int | str) -> Limb:
 
 def match_positions(
     skeleton: Skeleton,
-    rot: Tensor,
-    root_pos: Tensor,
-    targets: Mapping[int | str, Tensor],
+    rot: np.ndarray,
+    root_pos: np.ndarray,
+    targets: Mapping[int | str, np.ndarray],
     limbs: Mapping[int | str, Limb] | None = None,
     soft: float = SOFT,
-) -> Tensor:
+) -> np.ndarray:
     """The motion with hands and feet on their targets and all else kept: new `rot (T, J, 4)` wxyz.
 
     The knee or elbow is bent to the right length about its own axis, then the whole limb swings by the
@@ -107,13 +106,12 @@ def match_positions(
         limbs: which joints move a target, `limb_of` by default.
         soft: see `soft_reach`; a limb that the motion itself holds straighter may stay so.
     """
-    out = rot.clone()
+    out = rot.copy()
     for joint, goal in targets.items():
         limb = (limbs or {}).get(joint) or limb_of(skeleton, joint)
         pos, quat = skeleton.forward(root_pos, out)
-        goal = torch.as_tensor(goal, dtype=rot.dtype)
         now = pos[:, limb.end]
-        goal = torch.where(goal.isfinite().all(-1, keepdim=True), goal, now)
+        goal = np.where(np.isfinite(goal).all(-1, keepdims=True), goal, now)
         hip, knee = pos[:, limb.root], pos[:, limb.mid]
         bend, swing = _reach(hip, knee, now, goal, quat[:, limb.root], soft)
         _turn(skeleton, out, quat, limb, bend, swing)
@@ -121,51 +119,56 @@ def match_positions(
 
 
 def _reach(
-    root: Tensor, mid: Tensor, end: Tensor, goal: Tensor, upper_quat: Tensor, soft: float
-) -> tuple[Tensor, Tensor]:
+    root: np.ndarray,
+    mid: np.ndarray,
+    end: np.ndarray,
+    goal: np.ndarray,
+    upper_quat: np.ndarray,
+    soft: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """World turns (wxyz) of the lower bone about the knee, then of the whole limb about its root."""
     u, v = root - mid, end - mid
-    l1, l2 = u.norm(dim=-1), v.norm(dim=-1)
-    now, want = (end - root).norm(dim=-1), (goal - root).norm(dim=-1)
+    l1, l2 = norm(u), norm(v)
+    now, want = norm(end - root), norm(goal - root)
     # A limb that is straighter than the soft reach allows may stay as straight as it is.
-    span = torch.maximum(soft_reach(want, l1, l2, soft), torch.minimum(want, now))
+    span = np.maximum(soft_reach(want, l1, l2, soft), np.minimum(want, now))
     axis, sine = _bend_axis(-u, v, upper_quat)
     span = now + _through_straight(sine) * (span - now)
     # |u - R v|^2 = d^2 gives A cos(delta) + B sin(delta) = (|u|^2 + |v|^2 - d^2) / 2 - C for R the turn
     # by delta about the axis n: A = u_n . v_n (parts across n), B = u . (n x v), C = (u . n) (v . n).
     c = (u * axis).sum(-1) * (v * axis).sum(-1)
     a = (u * v).sum(-1) - c
-    b = (u * torch.linalg.cross(axis, v)).sum(-1)
-    size = torch.hypot(a, b).clamp_min(1e-12)
-    fold = torch.atan2(b, a)
-    open_by = torch.acos((((l1**2 + l2**2 - span**2) / 2 - c) / size).clamp(-1.0, 1.0))
+    b = (u * cross(axis, v)).sum(-1)
+    size = np.maximum(np.hypot(a, b), 1e-12)
+    fold = np.arctan2(b, a)
+    open_by = np.arccos(np.clip(((l1**2 + l2**2 - span**2) / 2 - c) / size, -1.0, 1.0))
     # The limb is folded at delta = fold; it bends on the axis' positive side, except where it is
     # stretched beyond straight and need not bend more than about that, or really bends that way.
     flexion = math.pi - open_by
-    little = flexion < 1.5 * torch.asin((-sine).clamp(0.0, 1.0)) + 1e-9
-    over = torch.zeros_like(little)
-    for first, last in find_runs((sine < 0).numpy(), 0):
+    little = flexion < 1.5 * np.arcsin(np.clip(-sine, 0.0, 1.0)) + 1e-9
+    over = np.zeros_like(little)
+    for first, last in find_runs((sine < 0), 0):
         spell = slice(first, last + 1)
         # One side for a whole spell: a knee that changed it within one would jump.
         over[spell] = bool(little[spell].all()) or float(sine[spell].min()) < -BACKWARDS
-    delta = fold - torch.where(over, -open_by, open_by)
-    delta = torch.remainder(delta + math.pi, 2 * math.pi) - math.pi
+    delta = fold - np.where(over, -open_by, open_by)
+    delta = np.remainder(delta + math.pi, 2 * math.pi) - math.pi
     # Nothing to do stays nothing to do, whatever rounding says about a straight limb.
-    delta = torch.where((span - now).abs() < 1e-12, torch.zeros_like(delta), delta)
+    delta = np.where(np.abs(span - now) < 1e-12, np.zeros_like(delta), delta)
     bend = axis_angle_to_quat(axis, delta)
     reached = quat_rotate(bend, v) - u
     return bend, shortest_arc(reached, goal - root)
 
 
-def _through_straight(sine: Tensor) -> Tensor:
+def _through_straight(sine: np.ndarray) -> np.ndarray:
     """`(T,)`, how much of a correction a limb gets that bends either way, by the sine of its bend.
 
     One that really bends backwards passes through straight on its way. What shortens it there would
     bend it to one side before and to the other after that, in a jump; so nothing does.
     """
-    share = torch.ones_like(sine)
-    small = (sine.abs() / BACKWARDS).clamp(max=1.0)
-    for first, last in find_runs((sine < 0).numpy(), 0):
+    share = np.ones_like(sine)
+    small = np.minimum(np.abs(sine) / BACKWARDS, 1.0)
+    for first, last in find_runs((sine < 0), 0):
         if float(sine[first : last + 1].min()) >= -BACKWARDS:
             continue
         while first > 0 and 0 <= float(sine[first - 1]) < BACKWARDS:
@@ -176,54 +179,60 @@ def _through_straight(sine: Tensor) -> Tensor:
     return share
 
 
-def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor, Tensor]:
+def _bend_axis(
+    upper: np.ndarray, lower: np.ndarray, upper_quat: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The unit axis `(T, 3)` about which a limb bends, and the signed sine of its bend about it.
 
     Where it is nearly straight, the mean axis of the clip in the upper bone's own frame.
     """
-    cross = torch.linalg.cross(normalize(upper), normalize(lower))
-    own = quat_rotate_inv(upper_quat, cross)
-    signed = _side(own).unsqueeze(-1) * own
+    own = quat_rotate_inv(upper_quat, cross(normalize(upper), normalize(lower)))
+    signed = _side(own)[..., None] * own
     usual = signed.sum(0)
-    if float(usual.norm()) < 1e-6 * len(own):
+    if float(norm(usual)) < 1e-6 * len(own):
         usual = across(quat_rotate_inv(upper_quat, upper)[0])
-    usual = normalize(usual).expand_as(own)
-    size = own.norm(dim=-1, keepdim=True)
+    usual = np.broadcast_to(normalize(usual), own.shape)
+    size = norm(own, keepdims=True)
     # Full weight on the moment's own axis from 2 * STRAIGHT on.
-    share = ((size - STRAIGHT) / STRAIGHT).clamp(0.0, 1.0)
+    share = np.clip((size - STRAIGHT) / STRAIGHT, 0.0, 1.0)
     share = smoothstep(share)
-    mixed = share * signed / size.clamp_min(1e-12) + (1 - share) * usual
-    axis = normalize(torch.where(mixed.norm(dim=-1, keepdim=True) < 0.1, usual, mixed))
+    mixed = share * signed / np.maximum(size, 1e-12) + (1 - share) * usual
+    axis = normalize(np.where(norm(mixed, keepdims=True) < 0.1, usual, mixed))
     return quat_rotate(upper_quat, axis), (own * axis).sum(-1)
 
 
-def _side(own: Tensor) -> Tensor:
+def _side(own: np.ndarray) -> np.ndarray:
     """`(T,)` 1 where a limb bends to its usual side, -1 where it is stretched beyond straight.
 
     own: `(T, 3)`, the axis of its bend in the upper bone's frame, as long as the bend's sine. It turns
     round as the limb passes through straight; where it turns without that, the side is the same.
     """
-    bent = (own.norm(dim=-1) > BENT).nonzero().squeeze(-1)
+    bent = np.flatnonzero(norm(own) > BENT)
     if not len(bent):
-        return torch.ones(len(own), dtype=own.dtype)
+        return np.ones(len(own), dtype=own.dtype)
     same = (own[bent[1:]] * own[bent[:-1]]).sum(-1) >= 0
-    ones = torch.ones(1, dtype=own.dtype)
-    side = torch.cat((ones, torch.where(same, 1.0, -1.0).to(own))).cumprod(0)
-    if float((side * own[bent].square().sum(-1)).sum()) < 0:
+    ones = np.ones(1, dtype=own.dtype)
+    side = np.concatenate((ones, np.where(same, 1.0, -1.0))).cumprod(0)
+    if float((side * np.square(own[bent]).sum(-1)).sum()) < 0:
         side = -side
-    last = (torch.searchsorted(bent, torch.arange(len(own)), right=True) - 1).clamp_min(0)
+    last = np.maximum(np.searchsorted(bent, np.arange(len(own)), side="right") - 1, 0)
     return side[last]
 
 
 def _turn(
-    skeleton: Skeleton, rot: Tensor, quat: Tensor, limb: Limb, bend: Tensor, swing: Tensor
+    skeleton: Skeleton,
+    rot: np.ndarray,
+    quat: np.ndarray,
+    limb: Limb,
+    bend: np.ndarray,
+    swing: np.ndarray,
 ) -> None:
     """Writes the turns into the local rotations; the end keeps its world rotation `quat`."""
     parents = skeleton.parents
     both = quat_mul(swing, bend)
 
-    def above(j: int) -> Tensor:
-        one = torch.zeros_like(swing)
+    def above(j: int) -> np.ndarray:
+        one = np.zeros_like(swing)
         one[:, 0] = 1.0
         return quat[:, parents[j]] if parents[j] >= 0 else one
 

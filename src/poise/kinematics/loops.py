@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.kinematics.coords import qpos_velocity
@@ -91,19 +89,19 @@ def close_cycle(qpos: np.ndarray) -> tuple[np.ndarray, float]:
     gap = out[-1, 7:] - out[0, 7:]
     gap -= 2 * math.pi * np.round(gap / (2 * math.pi))
     out[:, 7:] -= share * gap
-    root = torch.tensor(out[:, 3:7])
+    root = out[:, 3:7]
     ends = root[[0, -1]]
     first, last = quat_between(heading_quat(ends), ends)
     # R_i' = R_i exp(s log(tilt_last^-1 tilt_first)) ends on heading_last tilt_first.
     lean = quat_to_rotvec(quat_between(last, first))
-    out[:, 3:7] = quat_mul(root, rotvec_to_quat(torch.tensor(share) * lean)).numpy()
-    widest = max(float(np.abs(gap).max(initial=0.0)), float(lean.norm()))
+    out[:, 3:7] = quat_mul(root, rotvec_to_quat(share * lean))
+    widest = max(float(np.abs(gap).max(initial=0.0)), float(np.linalg.norm(lean)))
     return out, math.degrees(widest)
 
 
-def cycle_step(qpos: np.ndarray) -> tuple[Tensor, Tensor]:
+def cycle_step(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What one cycle adds: a turn about Z (wxyz), then a horizontal travel (m)."""
-    first, last = torch.tensor(qpos[0]), torch.tensor(qpos[-1])
+    first, last = qpos[0], qpos[-1]
     turn = quat_mul(heading_quat(last[3:7]), quat_conj(heading_quat(first[3:7])))
     travel = last[:3] - quat_rotate(turn, first[:3])
     travel[2] = 0.0
@@ -113,12 +111,12 @@ def cycle_step(qpos: np.ndarray) -> tuple[Tensor, Tensor]:
 def cycle_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
     """`qpos_velocity` of a closed cycle: the differences at its ends reach across the seam."""
     turn, travel = cycle_step(qpos)
-    ahead, behind = torch.tensor(qpos[1]), torch.tensor(qpos[-2])
+    ahead, behind = qpos[1].copy(), qpos[-2].copy()
     ahead[:3] = quat_rotate(turn, ahead[:3]) + travel
     ahead[3:7] = quat_mul(turn, ahead[3:7])
     behind[:3] = quat_rotate(quat_conj(turn), behind[:3] - travel)
     behind[3:7] = quat_between(turn, behind[3:7])
-    return qpos_velocity(np.vstack((behind.numpy(), qpos, ahead.numpy())), fps)[1:-1]
+    return qpos_velocity(np.vstack((behind, qpos, ahead)), fps)[1:-1]
 
 
 #: The last pose is the first again, or the one before it, within this share of a frame's step and this
@@ -184,12 +182,8 @@ def best_period(clip: Clip, period: int, overlap: int, first: int = 2, stop: int
     s = np.linspace(0.0, 1.0, period + 1)
     share = s**3 * (10 - 15 * s + 6 * s * s)
     root = even.root_pos[here] * (1 - share[:, None]) + even.root_pos[before] * share[:, None]
-    rot = slerp(
-        torch.tensor(even.rot[here]),
-        torch.tensor(even.rot[before]),
-        torch.tensor(share)[:, None].expand(-1, even.rot.shape[1]),
-    )
-    return clip.replaced(root_pos=root[:end], rot=rot.numpy()[:end])
+    rot = slerp(even.rot[here], even.rot[before], share[:, None])
+    return clip.replaced(root_pos=root[:end], rot=rot[:end])
 
 
 def _even(clip: Clip, k: int, period: int) -> Clip:
@@ -197,9 +191,9 @@ def _even(clip: Clip, k: int, period: int) -> Clip:
     over time, so that the two lie on each other; frame k P stays where it is."""
     here, before = (slice(j * period, (j + 1) * period + 1) for j in (k, k - 1))
     share = (np.arange(clip.frames) - k * period) / period
-    quat = torch.tensor(clip.rot[:, 0])
+    quat = clip.rot[:, 0]
     turned = heading_quat(quat_mul(quat[here], quat_conj(quat[before])))
-    angle = -float(2 * torch.atan2(turned[:, 3].sum(), turned[:, 0].sum())) * share
+    angle = -float(2 * np.arctan2(turned[:, 3].sum(), turned[:, 0].sum())) * share
     x, y = clip.root_pos[k * period, :2]
     c, s = np.cos(angle), np.sin(angle)
     stays = np.stack((x - c * x + s * y, y - s * x - c * y, np.zeros(len(angle))), -1)
@@ -239,8 +233,8 @@ def cut_loop(
     speed = np.gradient(near, 1.0 / fps, axis=0) * SPEED_S
     # The root's way on the floor is no difference of places, but one of speeds.
     way = np.gradient(clip.root_pos, 1.0 / fps, axis=0)
-    turn = quat_conj(heading_quat(torch.tensor(clip.rot[:, 0])))
-    speed += (quat_rotate(turn, torch.tensor(way)).numpy() * SPEED_S)[:, None]
+    turn = quat_conj(heading_quat(clip.rot[:, 0]))
+    speed += (quat_rotate(turn, way) * SPEED_S)[:, None]
     alike = np.concatenate((near, speed), 1).reshape(clip.frames, -1)
     kept = np.ones(clip.frames, dtype=bool)
     for start, stop in without:
@@ -265,26 +259,25 @@ def cut_loop(
         )
     _, i, j = best
     here, before = np.arange(i, j + 1), np.arange(j - joins, j + 1) - (j - i)
-    first, last = (torch.tensor(clip.rot[k, 0]) for k in (i, j))
+    first, last = (clip.rot[k, 0] for k in (i, j))
     onto = quat_mul(heading_quat(last), quat_conj(heading_quat(first)))
-    turns = onto.expand(len(before), 4)
-    along = quat_rotate(turns, torch.tensor(clip.root_pos[before] - clip.root_pos[i]))
-    along += torch.tensor(clip.root_pos[j] * [1.0, 1.0, 0.0] + clip.root_pos[i] * [0.0, 0.0, 1.0])
-    turned = torch.tensor(clip.rot[before])
+    turns = np.broadcast_to(onto, (len(before), 4))
+    along = quat_rotate(turns, clip.root_pos[before] - clip.root_pos[i])
+    along += clip.root_pos[j] * [1.0, 1.0, 0.0] + clip.root_pos[i] * [0.0, 0.0, 1.0]
+    turned = clip.rot[before].copy()
     turned[:, 0] = quat_mul(turns, turned[:, 0])
     s = np.linspace(0.0, 1.0, joins + 1)
-    share = torch.tensor(s**3 * (10 - 15 * s + 6 * s * s))
+    share = (s**3 * (10 - 15 * s + 6 * s * s))[:, None]
     root, rot = clip.root_pos[here].copy(), clip.rot[here].copy()
     tail = slice(-joins - 1, None)
-    root[tail] += (share[:, None] * (along - torch.tensor(root[tail]))).numpy()
-    wide = share[:, None].expand(-1, rot.shape[1])
-    rot[tail] = slerp(torch.tensor(rot[tail]), turned, wide).numpy()
+    root[tail] += share * (along - root[tail])
+    rot[tail] = slerp(rot[tail], turned, np.broadcast_to(share, rot[tail].shape[:2]))
     apart = float(np.linalg.norm(near[i] - near[j], axis=-1).mean())
     return clip.replaced(root_pos=root, rot=rot, cyclic=True), apart
 
 
 def _from_root(clip: Clip, pos: np.ndarray) -> np.ndarray:
     """`(T, J, 3)` m, joints seen from below the root, where it faces."""
-    turn = quat_conj(heading_quat(torch.tensor(clip.rot[:, 0])))[:, None]
+    turn = quat_conj(heading_quat(clip.rot[:, 0]))[:, None]
     flat = pos - pos[:, :1] * [1.0, 1.0, 0.0]
-    return quat_rotate(turn.expand(-1, pos.shape[1], 4), torch.tensor(flat)).numpy()
+    return quat_rotate(np.broadcast_to(turn, (*pos.shape[:2], 4)), flat)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, read_mjcf
 from poise.errors import PoiseError
@@ -16,8 +15,8 @@ from poise.kinematics.ground import GroundFit, fit_ground
 from poise.kinematics.loops import Cycle, join_cycle
 from poise.kinematics.repair.estimate import CleanReport, clean_clip
 from poise.kinematics.repair.motion_doctor import without_noise
-from poise.kinematics.retarget.retarget_report import RetargetReport
-from poise.kinematics.retarget.transfer import RetargetConfig, retarget
+from poise.kinematics.retargeting.retarget_report import RetargetReport
+from poise.kinematics.retargeting.transfer import RetargetConfig, retarget
 from poise.motion import Clip, ClipLibrary, Skeleton, resample
 
 #: How much deeper (m) than the clip its closed cycle may go; beyond, closing it made another motion.
@@ -136,7 +135,7 @@ def on_own_body(library: ClipLibrary, config: BodyConfig) -> tuple[ClipLibrary, 
 
 def joint_error(clip: Clip, qpos: np.ndarray, table: BodyTable) -> float:
     """Mean distance in mm between the clip's joints and the body's, as they lie about the root."""
-    here = Kinematics(table)(torch.tensor(qpos)).pos.numpy()
+    here = Kinematics(table)(qpos).pos
     there = clip.positions()[:, [r.joint for r in table.rows]]
     apart = (here - here[:, :1]) - (there - there[:, :1])
     return float(np.linalg.norm(apart, axis=-1).mean() * 1000)
@@ -147,8 +146,8 @@ def _join(qpos: np.ndarray, table: BodyTable) -> tuple[np.ndarray, Cycle]:
     joined, cycle = join_cycle(qpos, [name for row in table.rows for name in row.hinge_names()])
     depths = []
     for q in (qpos, joined):
-        state = Kinematics(table)(torch.tensor(q))
-        low = lowest_height(table, state.pos, state.quat).min(-1).values
-        depths.append(float(low.quantile(0.1)))
+        state = Kinematics(table)(q)
+        low = lowest_height(table, state.pos, state.quat).min(-1)
+        depths.append(float(np.quantile(low, 0.1)))
     sunk = depths[0] - depths[1]
     return (qpos, replace(cycle, sunk_m=sunk)) if sunk > CYCLE_SINK_M else (joined, cycle)

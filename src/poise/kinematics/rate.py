@@ -219,8 +219,8 @@ class Moved:
     def __init__(self, clip: Clip, table: BodyTable) -> None:
         self.fps, self.table = clip.fps, table
         self.pos, self.quat = poses_of(clip, table)
-        points = extreme_points(table, self.pos, self.quat).numpy()
-        self.com = centre_of_mass(table, self.pos, self.quat).numpy()
+        points = extreme_points(table, self.pos, self.quat)
+        self.com = centre_of_mass(table, self.pos, self.quat)
         self.low: np.ndarray = points[..., 2].min(-1)
         self.floor = float(np.quantile(self.low, 0.1))
         bears = points[..., 2] < self.floor + BEAR_M
@@ -261,7 +261,7 @@ class Moved:
         soles = soles_of(self.table, self.pos, self.quat)
         if not soles:
             return None
-        ends = np.concatenate([s.ends.numpy() for s in soles.values()], 1)
+        ends = np.concatenate([s.ends for s in soles.values()], 1)
         near = ends[..., 2] < self.floor + NEAR_M
         steps, own = np.diff(ends[..., :2], axis=0), np.diff(self.com[:, :2], axis=0)
         speed = np.where(near[1:] & near[:-1], np.linalg.norm(steps, axis=-1), np.inf)
@@ -315,7 +315,7 @@ class Moved:
         rows = {(r.kind, r.side): i for i, r in enumerate(self.table.rows)}
         try:
             return tuple(
-                [self.pos[:, rows[kind, side]].numpy() for side in ("left", "right")]
+                [self.pos[:, rows[kind, side]] for side in ("left", "right")]
                 for kind in ("thigh", "shin", "foot")
             )
         except KeyError:

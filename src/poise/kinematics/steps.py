@@ -7,8 +7,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError
@@ -26,6 +24,7 @@ from poise.motion.rotations import (
     slerp,
 )
 from poise.motion.smoothing import find_runs, smooth_lift, smoothstep
+from poise.motion.vectors import cross, lerp, norm
 
 #: Below this distance (m) of ankle or toes, whichever is less, a foot shuffles, turns or rolls.
 LEAST_M = 0.05
@@ -48,7 +47,7 @@ class FootStep(NamedTuple):
     stop: int
 
 
-def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[FootStep, ...]:
+def missing_steps(soles: np.ndarray, stands: np.ndarray, fps: float) -> tuple[FootStep, ...]:
     """The steps that must be taken for feet to stand where both ends of a gap have them.
 
     Args:
@@ -60,9 +59,9 @@ def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[FootStep, 
     moved first steps first.
     """
     (frames, feet), ankles = soles.shape[:2], soles[:, :, 0]
-    apart = (soles[-1, ..., :2] - soles[0, ..., :2]).norm(dim=-1).amin(-1)
+    apart = norm(soles[-1, ..., :2] - soles[0, ..., :2]).min(-1)
     wanting = [k for k in range(feet) if bool(stands[:, k].all()) and apart[k] > LEAST_M]
-    stands = stands.clone()
+    stands = stands.copy()
     found: list[FootStep] = []
     for k in sorted(wanting, key=lambda k: _moved(ankles[:, k])):
         seconds = SWING_S + SWING_S_PER_M * float(apart[k])
@@ -71,21 +70,24 @@ def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[FootStep, 
             continue
         others = [j for j in range(feet) if j != k]
         later = len(wanting) - len(found) - 1
-        start = _when(_moved(ankles[:, k]), ~stands[:, others].all(1), length, later)
+        busy = np.asarray(~stands[:, others].all(1))
+        start = _when(_moved(ankles[:, k]), busy, length, later)
         found.append(FootStep(k, start, start + length))
         stands[start : start + length, k] = False
     return tuple(found)
 
 
-def stepping(stands: Tensor, steps: Sequence[FootStep], columns: Sequence[Sequence[int]]) -> Tensor:
+def stepping(
+    stands: np.ndarray, steps: Sequence[FootStep], columns: Sequence[Sequence[int]]
+) -> np.ndarray:
     """Contacts `(T, F)` with the feet of `steps` off the floor; columns: those of every foot."""
-    stands = stands.clone()
+    stands = stands.copy()
     for step in steps:
         stands[step.start : step.stop, list(columns[step.foot])] = False
     return stands
 
 
-def rises(soles: Tensor, stands: Tensor) -> Tensor:
+def rises(soles: np.ndarray, stands: np.ndarray) -> np.ndarray:
     """`(T, K)` m, how much higher feet must be for each to be `CLEAR_M` clear of the floor in mid-swing.
 
     Args:
@@ -95,40 +97,40 @@ def rises(soles: Tensor, stands: Tensor) -> Tensor:
     The floor is at the lowest place of each end of the foot. Of a swing by more than `LEAST_M` the
     height h(t) above it is to be at least `CLEAR_M sin(pi t)`, by A sin^2(pi t) more.
     """
-    height = soles[..., 2] - soles[..., 2].amin(0)
-    low, up = height.amin(-1), torch.zeros(stands.shape, dtype=soles.dtype)
+    height = soles[..., 2] - soles[..., 2].min(0)
+    low, up = height.min(-1), np.zeros(stands.shape, dtype=soles.dtype)
     free = ~stands
     free[[0, -1]] = False
     for k in range(stands.shape[1]):
-        for first, last in find_runs(free[:, k].numpy(), 0):
+        for first, last in find_runs(free[:, k], 0):
             gone = soles[last + 1, k, :, :2] - soles[first - 1, k, :, :2]
-            if gone.norm(dim=-1).amin() <= LEAST_M:
+            if norm(gone).min() <= LEAST_M:
                 continue
             count = last - first + 1
-            t = torch.arange(1, count + 1, dtype=soles.dtype) / (count + 1)
-            arc = torch.sin(torch.pi * t)
+            t = np.arange(1, count + 1, dtype=soles.dtype) / (count + 1)
+            arc = np.sin(np.pi * t)
             short = (CLEAR_M * arc - low[first : last + 1, k]) / arc**2
-            inner = (t - 0.5).abs() <= 0.5 * _MIDDLE
+            inner = np.abs(t - 0.5) <= 0.5 * _MIDDLE
             if bool(inner.any()):
-                up[first : last + 1, k] = short[inner].amax().clamp(0, CLEAR_M) * arc**2
+                up[first : last + 1, k] = np.clip(short[inner].max(), 0, CLEAR_M) * arc**2
     return up
 
 
-def _moved(path: Tensor) -> float:
+def _moved(path: np.ndarray) -> float:
     """The frame by which half of the way `(T, 3)` is done."""
-    way = torch.diff(path[:, :2], dim=0).norm(dim=-1).cumsum(0)
+    way = norm(np.diff(path[:, :2], axis=0)).cumsum(0)
     return float((way < 0.5 * way[-1]).sum())
 
 
-def _when(middle: float, busy: Tensor, length: int, later: int) -> int:
+def _when(middle: float, busy: np.ndarray, length: int, later: int) -> int:
     """The frame in which a step of `length` frames begins: with little of it while other feet are in
     the air (`busy (T)`), room after it for `later` more steps, then near `middle`."""
     frames = len(busy)
     last = max(_EDGE_FRAMES, frames - _EDGE_FRAMES - (later + 1) * length)
-    starts = torch.arange(_EDGE_FRAMES, last + 1)
-    in_air = torch.cat((torch.zeros(1), busy.double().cumsum(0)))
+    starts = np.arange(_EDGE_FRAMES, last + 1)
+    in_air = np.concatenate((np.zeros(1), busy.astype(float).cumsum(0)))
     clash = in_air[starts + length] - in_air[starts]
-    off = (starts + 0.5 * length - middle).abs() / frames
+    off = np.abs(starts + 0.5 * length - middle) / frames
     return int(starts[(clash + off).argmin()])
 
 
@@ -147,7 +149,7 @@ class Swing(NamedTuple):
 
 
 def planned(
-    ways: Sequence[float], up: Tensor, seconds: float, first: int, more: tuple[int, int] = (0, 0)
+    ways: Sequence[float], up: np.ndarray, seconds: float, first: int, more: tuple[int, int] = (0, 0)
 ) -> tuple[Swing, ...] | None:
     """The foot of each step and its time, as few steps as there may be; None where two feet cannot walk
     it.
@@ -179,7 +181,7 @@ def planned(
 
 
 def _timed(
-    order: list[int], ways: Sequence[float], up: Tensor, seconds: float
+    order: list[int], ways: Sequence[float], up: np.ndarray, seconds: float
 ) -> tuple[Swing, ...] | None:
     n = len(order)
     # A longer step has more of the time, one that is under way in a keyframe about half of it.
@@ -218,7 +220,7 @@ def planted(
     skeleton: Skeleton,
     motion: Motion,
     off_floor: tuple[bool, bool],
-    lean: Tensor,
+    lean: np.ndarray,
     falls: tuple[float, float],
     fps: float,
 ) -> Motion:
@@ -243,24 +245,24 @@ def planted(
     (root, rot), back = motion, off_floor[0]
     pos = skeleton.forward(root, rot)[0]
     stands = -1 if back else 0
-    left = (pos[stands, hips[0][0]] - pos[stands, hips[1][0]]) * root.new_tensor((1.0, 1.0, 0.0))
-    left = left / left.norm().clamp_min(1e-9)
-    facing = torch.stack((left[1], -left[0], left[2]))
-    root, turned = root.clone(), rot.clone()
-    root[1:-1] -= TRUNK_M * lean.sin()[:, None] * facing
-    leans = axis_angle_to_quat(left.expand(len(lean), 3), lean)
+    left = (pos[stands, hips[0][0]] - pos[stands, hips[1][0]]) * np.array((1.0, 1.0, 0.0))
+    left = left / np.maximum(norm(left), 1e-9)
+    facing = np.stack((left[1], -left[0], left[2]))
+    root, turned = root.copy(), rot.copy()
+    root[1:-1] -= TRUNK_M * np.sin(lean)[:, None] * facing
+    leans = axis_angle_to_quat(np.broadcast_to(left, (len(lean), 3)), lean)
     turned[1:-1, 0] = quat_mul(leans, rot[1:-1, 0])
     pos, quat = skeleton.forward(root, turned)
     toes = {skeleton.parents[toe]: toe for _, toe in anatomy.toes}
-    goals: dict[int | str, Tensor] = {}
+    goals: dict[int | str, np.ndarray] = {}
     for joint in ankles:
         sole = pos[stands, toes[joint]] - pos[stands, joint] if joint in toes else SOLE_M * facing
         parts = [pos[:, joint], quat[:, joint], root]
         if back:
-            parts = [x.flip(0) for x in parts]
+            parts = [np.flip(x, 0) for x in parts]
         goal, turn = _leaves(*parts, sole, falls[0 if back else 1], fps)
         if back:
-            goal, turn = goal.flip(0), turn.flip(0)
+            goal, turn = np.flip(goal, 0), np.flip(turn, 0)
         goals[joint] = goal
         turned[:, joint] = quat_between(quat[:, skeleton.parents[joint]], turn)
     out = match_positions(skeleton, turned, root, goals, soft=SOFT)
@@ -270,37 +272,39 @@ def planted(
 
 
 def _leaves(
-    ankle: Tensor, quat: Tensor, root: Tensor, sole: Tensor, fall: float, fps: float
-) -> tuple[Tensor, Tensor]:
+    ankle: np.ndarray, quat: np.ndarray, root: np.ndarray, sole: np.ndarray, fall: float, fps: float
+) -> tuple[np.ndarray, np.ndarray]:
     """An ankle's place and rotation, `(T, 3)` and `(T, 4)`, standing in the first frame, with
     its toes at `sole (3,)` m from it, and in the air for the last `fall` s."""
     frames = len(ankle)
-    t = (torch.arange(frames, dtype=ankle.dtype) - (frames - 1)) / fps + fall
-    first = max(0, min(frames - 2, int(torch.searchsorted(t, torch.tensor(0.0, dtype=t.dtype)))))
+    t = (np.arange(frames, dtype=ankle.dtype) - (frames - 1)) / fps + fall
+    first = max(0, min(frames - 2, int(np.searchsorted(t, 0.0))))
     # Heels rise by HEEL_M (1 + t / HEEL_S)^2 up to the take-off, where the legs are long.
-    up = HEEL_M * (1.0 + t.clamp_max(0.0) / HEEL_S).clamp_min(0.0).square()
-    zero = torch.zeros_like(up)
-    raised = torch.stack((zero, zero, up), -1)
-    leaves = raised.new_tensor((0.0, 0.0, 2.0 * HEEL_M / HEEL_S))
+    up = HEEL_M * np.square(np.maximum(1.0 + np.minimum(t, 0.0) / HEEL_S, 0.0))
+    zero = np.zeros_like(up)
+    raised = np.stack((zero, zero, up), -1)
+    leaves = np.array((0.0, 0.0, 2.0 * HEEL_M / HEEL_S))
     ahead = (root[first + 1] - root[first]) * fps
-    u = (t / max(fall, 1e-6)).clamp(0.0, 1.0)[:, None]
+    u = np.clip(t / max(fall, 1e-6), 0.0, 1.0)[:, None]
     off = hermite(
         u,
         ankle[0] + raised[first] - root[first] + ahead * t[first],
         ankle[-1] - root[-1],
         (leaves - ahead) * fall,
-        torch.zeros(3, dtype=ankle.dtype),
+        np.zeros(3, dtype=ankle.dtype),
     )
-    place = torch.where((t < 0.0)[:, None], ankle[0] + raised, root + off)
+    place = np.where((t < 0.0)[:, None], ankle[0] + raised, root + off)
     # A heel that rises turns the foot about its toes.
-    flat = sole[:2] / sole[:2].norm().clamp_min(1e-9)
-    axis = torch.stack((-flat[1], flat[0], 0.0 * flat[0])).expand(frames, 3)
-    length = max(float(sole.norm()), HEEL_M)
-    tilted = quat_mul(axis_angle_to_quat(axis, (up / length).asin()), quat[:1])
-    return place, slerp(tilted, quat[-1:].expand_as(tilted), smoothstep(u[:, 0]))
+    flat = sole[:2] / np.maximum(norm(sole[:2]), 1e-9)
+    axis = np.broadcast_to(np.stack((-flat[1], flat[0], 0.0 * flat[0])), (frames, 3))
+    length = max(float(norm(sole)), HEEL_M)
+    tilted = quat_mul(axis_angle_to_quat(axis, np.arcsin(up / length)), quat[:1])
+    return place, slerp(tilted, np.broadcast_to(quat[-1:], tilted.shape), smoothstep(u[:, 0]))
 
 
-def hermite(u: Tensor, start: Tensor, stop: Tensor, leave: Tensor, reach: Tensor) -> Tensor:
+def hermite(
+    u: np.ndarray, start: np.ndarray, stop: np.ndarray, leave: np.ndarray, reach: np.ndarray
+) -> np.ndarray:
     """The cubic from `start` to `stop` at `u` from 0 to 1, with its derivatives at both ends."""
     rise = smoothstep(u)
     return start + rise * (stop - start) + u * (1.0 - u) ** 2 * leave - u * u * (1.0 - u) * reach
@@ -317,53 +321,60 @@ class Ends(NamedTuple):
     each is in the air `(2, K)`, and where the toes of a foot that is level there would be `(2, K, 3)`,
     with its rotation `(2, K, 4)`."""
 
-    toe: Tensor
-    quat: Tensor
-    up: Tensor
-    level_toe: Tensor
-    level_quat: Tensor
+    toe: np.ndarray
+    quat: np.ndarray
+    up: np.ndarray
+    level_toe: np.ndarray
+    level_quat: np.ndarray
 
 
 class FootPath(NamedTuple):
     """Ankle `(T, 3)` m and rotation `(T, 4)` of a foot, and that which it had if no heel rose."""
 
-    ankle: Tensor
-    turn: Tensor
-    flat: Tensor
+    ankle: np.ndarray
+    turn: np.ndarray
+    flat: np.ndarray
 
 
 def ends_of(
-    pos: Tensor, quat: Tensor, ankles: Sequence[int], toes: Sequence[int], soles: Tensor,
+    pos: np.ndarray, quat: np.ndarray, ankles: Sequence[int], toes: Sequence[int], soles: np.ndarray,
     floor: tuple[float, float],
 ) -> Ends:  # fmt: skip
     """The feet of both keyframes, `(2, J, 3)` m and `(2, J, 4)`."""
     tip, turn = pos[:, list(toes)], quat[:, list(ankles)]
     off = pos[:, list(ankles), 2] - floor[0], tip[..., 2] - floor[1]
-    up = torch.minimum(*off) > UP_M
+    up = np.minimum(*off) > UP_M
     # A level foot points where it does, with its toes as much under the ankle as those that stand.
     way = tip - pos[:, list(ankles)]
-    drop = min(max(floor[0] - floor[1], 0.0), 0.9 * float(soles.norm(dim=-1).min()))
-    length = way.norm(dim=-1, keepdim=True)
-    flat = normalize(way * way.new_tensor((1.0, 1.0, 0.0))) * (length.square() - drop**2).sqrt()
-    level = flat - way.new_tensor((0.0, 0.0, drop))
+    drop = min(max(floor[0] - floor[1], 0.0), 0.9 * float(norm(soles).min()))
+    length = norm(way, keepdims=True)
+    flat = normalize(way * np.array((1.0, 1.0, 0.0))) * np.sqrt(np.square(length) - drop**2)
+    level = flat - np.array((0.0, 0.0, drop))
     level_quat = quat_mul(shortest_arc(way, level), turn)
     # It gets level about its heel where that stands, about its toes otherwise.
-    on_heel = (off[0] < off[1]).unsqueeze(-1)
-    level_toe = torch.where(on_heel, pos[:, list(ankles)] + level, tip)
+    on_heel = (off[0] < off[1])[..., None]
+    level_toe = np.where(on_heel, pos[:, list(ankles)] + level, tip)
     return Ends(tip, turn, up, level_toe, level_quat)
 
 
 def path_of(
-    t: Tensor, k: int, swings: Sequence[Swing], ends: Ends, sole: Tensor, leaves: Tensor | None
+    t: np.ndarray,
+    k: int,
+    swings: Sequence[Swing],
+    ends: Ends,
+    sole: np.ndarray,
+    leaves: np.ndarray | None,
 ) -> FootPath:
     """The path of one foot; toes are at `sole (3,)` m in its own frame, which leave at `leaves` m/s."""
     n, seconds = len(swings), float(t[-1])
     up = bool(ends.up[0, k]), bool(ends.up[1, k])
-    share = torch.arange(n + 1, dtype=t.dtype)[:, None] / max(n, 1)
-    places = torch.lerp(ends.level_toe[0, k], ends.level_toe[1, k], share)
-    places[:, 2] = torch.minimum(places[:, 2], ends.level_toe[:, :, 2].min() + 0.5 * UP_M)
+    share = np.arange(n + 1, dtype=t.dtype)[:, None] / max(n, 1)
+    places = lerp(ends.level_toe[0, k], ends.level_toe[1, k], share)
+    places[:, 2] = np.minimum(places[:, 2], ends.level_toe[:, :, 2].min() + 0.5 * UP_M)
     turns = slerp(
-        ends.level_quat[0, k].expand(n + 1, 4), ends.level_quat[1, k].expand(n + 1, 4), share[:, 0]
+        np.broadcast_to(ends.level_quat[0, k], (n + 1, 4)),
+        np.broadcast_to(ends.level_quat[1, k], (n + 1, 4)),
+        share[:, 0],
     )
     if up[0]:
         places[0], turns[0] = ends.toe[0, k], ends.quat[0, k]
@@ -371,43 +382,56 @@ def path_of(
         places[-1], turns[-1] = ends.toe[1, k], ends.quat[1, k]
     if n == 0:
         u = smoothstep(t / max(seconds, 1e-9))[:, None]
-        tip = torch.lerp(ends.level_toe[0, k], ends.level_toe[1, k], u)
+        tip = lerp(ends.level_toe[0, k], ends.level_toe[1, k], u)
         turn = slerp(
-            ends.level_quat[0, k].expand(len(t), 4), ends.level_quat[1, k].expand(len(t), 4), u[:, 0]
+            np.broadcast_to(ends.level_quat[0, k], (len(t), 4)),
+            np.broadcast_to(ends.level_quat[1, k], (len(t), 4)),
+            u[:, 0],
         )
     else:
-        tip, turn = places[:1].expand(len(t), 3).clone(), turns[:1].expand(len(t), 4).clone()
+        tip, turn = (
+            np.broadcast_to(places[:1], (len(t), 3)).copy(),
+            np.broadcast_to(turns[:1], (len(t), 4)).copy(),
+        )
     flat = turn
     for i, swing in enumerate(swings):
         if not (i == 0 and up[0]):
-            tilt = ROLL * (1.0 + (t - swing.start) / ROLL_S).clamp(0.0, 1.0).square()
+            tilt = ROLL * np.square(np.clip(1.0 + (t - swing.start) / ROLL_S, 0.0, 1.0))
             rolled = quat_mul(axis_angle_to_quat(_left(turn, sole), tilt), turn)
-            turn = torch.where((t <= swing.start)[:, None], rolled, turn)
+            turn = np.where((t <= swing.start)[:, None], rolled, turn)
         lasts = swing.stop - swing.start
-        u = ((t - swing.start) / lasts).clamp(0.0, 1.0)
+        u = np.clip((t - swing.start) / lasts, 0.0, 1.0)
         here, there = places[i], places[i + 1]
-        start = torch.zeros(3, dtype=t.dtype)
+        start = np.zeros(3, dtype=t.dtype)
         if i == 0 and up[0] and leaves is not None:
-            start = leaves * t.new_tensor((1.0, 1.0, 0.0))
-        stop = 1.5 * (there - here) if i == n - 1 and up[1] else torch.zeros(3, dtype=t.dtype)
-        swung = hermite(u[:, None], here, there, start * lasts, stop * t.new_tensor((1.0, 1.0, 0.0)))
-        clear = CLEAR_M * torch.sin(torch.pi * u).square()
-        swung = swung + torch.stack((0.0 * clear, 0.0 * clear, clear), -1)
-        at_start = turn[int((t <= swing.start + 1e-9).nonzero()[-1])]
-        turned = slerp(at_start.expand(len(t), 4), turns[i + 1].expand(len(t), 4), smoothstep(u))
+            start = leaves * np.array((1.0, 1.0, 0.0))
+        stop = 1.5 * (there - here) if i == n - 1 and up[1] else np.zeros(3, dtype=t.dtype)
+        swung = hermite(u[:, None], here, there, start * lasts, stop * np.array((1.0, 1.0, 0.0)))
+        clear = CLEAR_M * np.square(np.sin(np.pi * u))
+        swung = swung + np.stack((0.0 * clear, 0.0 * clear, clear), -1)
+        at_start = turn[int(np.flatnonzero(t <= swing.start + 1e-9)[-1])]
+        turned = slerp(
+            np.broadcast_to(at_start, (len(t), 4)),
+            np.broadcast_to(turns[i + 1], (len(t), 4)),
+            smoothstep(u),
+        )
         later = (t > swing.start)[:, None]
-        tip, turn = torch.where(later, swung, tip), torch.where(later, turned, turn)
-        even = slerp(turns[i].expand(len(t), 4), turns[i + 1].expand(len(t), 4), smoothstep(u))
-        flat = torch.where(later, even, flat)
+        tip, turn = np.where(later, swung, tip), np.where(later, turned, turn)
+        even = slerp(
+            np.broadcast_to(turns[i], (len(t), 4)),
+            np.broadcast_to(turns[i + 1], (len(t), 4)),
+            smoothstep(u),
+        )
+        flat = np.where(later, even, flat)
     tip, flat = _from_and_to(t, k, swings, up, ends, tip, flat)
     turn = _from_and_to(t, k, swings, up, ends, tip, turn)[1]
-    return FootPath(tip - quat_rotate(turn, sole.expand_as(tip)), turn, flat)
+    return FootPath(tip - quat_rotate(turn, np.broadcast_to(sole, tip.shape)), turn, flat)
 
 
 def _from_and_to(
-    t: Tensor, k: int, swings: Sequence[Swing], up: tuple[bool, bool], ends: Ends, tip: Tensor,
-    turn: Tensor,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    t: np.ndarray, k: int, swings: Sequence[Swing], up: tuple[bool, bool], ends: Ends, tip: np.ndarray,
+    turn: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """A foot that stands in a keyframe and is not level there gets level beside it."""
     seconds = float(t[-1])
     for end, since in ((0, t), (1, seconds - t)):
@@ -416,17 +440,17 @@ def _from_and_to(
         room = seconds / 2
         if swings:
             room = swings[0].start if end == 0 else seconds - swings[-1].stop
-        left = 1.0 - smoothstep((since / max(min(ROLL_S, room), LEAST_ROLL_S)).clamp(0.0, 1.0))
+        left = 1.0 - smoothstep(np.clip(since / max(min(ROLL_S, room), LEAST_ROLL_S), 0.0, 1.0))
         tip = tip + left[:, None] * (ends.toe[end, k] - ends.level_toe[end, k])
-        turn = slerp(turn, ends.quat[end, k].expand_as(turn), left)
+        turn = slerp(turn, np.broadcast_to(ends.quat[end, k], turn.shape), left)
     return tip, turn
 
 
-def _left(turn: Tensor, sole: Tensor) -> Tensor:
+def _left(turn: np.ndarray, sole: np.ndarray) -> np.ndarray:
     """`(T, 3)`, the level axis about which a heel rises; toes are at `sole (3,)` in the foot's frame."""
-    way = quat_rotate(turn, sole.expand(len(turn), 3))
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=way.dtype).expand_as(way)
-    return normalize(torch.linalg.cross(up, way))
+    way = quat_rotate(turn, np.broadcast_to(sole, (len(turn), 3)))
+    up = np.broadcast_to(np.array([0.0, 0.0, 1.0], dtype=way.dtype), way.shape)
+    return normalize(cross(up, way))
 
 
 #: The share of its length that a leg is stretched to, and m that hips come down for it at most.
@@ -461,18 +485,18 @@ def stepped(
     ankles, toes = anatomy.of("foot"), {skeleton.parents[t]: t for _, t in anatomy.toes}
     if len(ankles) != 2 or not all(a in toes for a in ankles):
         return None
-    root, rot = motion[0].clone(), motion[1].clone()
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
+    root, rot = motion[0].copy(), motion[1].copy()
+    offsets = np.array(skeleton.offsets)
     pos, quat = skeleton.forward(root, rot)
     soles = offsets[[toes[a] for a in ankles]]
     ends = ends_of(pos[[0, -1]], quat[[0, -1]], ankles, [toes[a] for a in ankles], soles, floor)
     seconds = (len(root) - 1) / fps
-    ways = [float(w[:2].norm()) for w in ends.level_toe[1] - ends.level_toe[0]]
+    ways = [float(norm(w[:2])) for w in ends.level_toe[1] - ends.level_toe[0]]
     past_toes = None
     if past is not None:
         was = skeleton.forward(*past)[0][0]
         past_toes = [(pos[0, toes[a]] - was[toes[a]]) * fps for a in ankles]
-    t = torch.arange(len(root), dtype=rot.dtype) / fps
+    t = np.arange(len(root), dtype=rot.dtype) / fps
     tried: set[tuple[Swing, ...]] = set()
     ways_to_go: list[tuple[float, list[FootPath]]] = []
     for first, *more in product((0, 1), (0, 1), (0, 1)):
@@ -501,16 +525,16 @@ def stepped(
 def _walked(
     skeleton: Skeleton,
     motion: Motion,
-    pos: Tensor,
-    quat: Tensor,
+    pos: np.ndarray,
+    quat: np.ndarray,
     ankles: Sequence[int],
     toes: Mapping[int, int],
     paths: Sequence[FootPath],
     fps: float,
 ) -> Motion:
     """The motion with its feet on their paths."""
-    root, rot = motion[0], motion[1].clone()
-    goals: dict[int | str, Tensor] = {}
+    root, rot = motion[0], motion[1].copy()
+    goals: dict[int | str, np.ndarray] = {}
     for ankle, path in zip(ankles, paths, strict=True):
         goals[ankle] = path.ankle
         rot[:, ankle] = quat_between(quat[:, skeleton.parents[ankle]], path.turn)
@@ -524,39 +548,39 @@ def _walked(
 
 
 def _cost(
-    skeleton: Skeleton, pos: Tensor, ankles: Sequence[int], paths: Sequence[FootPath], fps: float
+    skeleton: Skeleton, pos: np.ndarray, ankles: Sequence[int], paths: Sequence[FootPath], fps: float
 ) -> float:
     """How hard a plan is: by how much legs are too short for it, and feet faster than `FAST`."""
     worst = 0.0
     for ankle, path in zip(ankles, paths, strict=True):
         hip, length = _leg(skeleton, pos, ankle)
-        stretch = (path.ankle - hip).norm(dim=-1).amax() / length
-        speed = path.ankle.diff(dim=0).norm(dim=-1).amax() * fps
+        stretch = norm(path.ankle - hip).max() / length
+        speed = norm(np.diff(path.ankle, axis=0)).max() * fps
         worst += max(0.0, float(stretch) - 1.0) * 5.0 + max(0.0, float(speed) / FAST - 1.0)
     return worst
 
 
-def _leg(skeleton: Skeleton, pos: Tensor, ankle: int) -> tuple[Tensor, float]:
+def _leg(skeleton: Skeleton, pos: np.ndarray, ankle: int) -> tuple[np.ndarray, float]:
     """The hip `(T, 3)` m and the length of a leg."""
     limb = limb_of(skeleton, ankle)
     bones = ((limb.root, limb.mid), (limb.mid, limb.end))
-    return pos[:, limb.root], sum(float((pos[0, a] - pos[0, b]).norm()) for a, b in bones)
+    return pos[:, limb.root], sum(float(norm(pos[0, a] - pos[0, b])) for a, b in bones)
 
 
 def _lowered(
-    skeleton: Skeleton, root: Tensor, pos: Tensor, goals: dict[int | str, Tensor], fps: float
-) -> Tensor:
+    skeleton: Skeleton, root: np.ndarray, pos: np.ndarray, goals: dict[int | str, np.ndarray], fps: float
+) -> np.ndarray:
     """The root, lower where a leg would not reach its goal."""
-    short = torch.zeros(len(root), dtype=root.dtype)
+    short = np.zeros(len(root), dtype=root.dtype)
     for ankle, goal in goals.items():
         hip, length = _leg(skeleton, pos, skeleton.index(ankle) if isinstance(ankle, str) else ankle)
         off = goal - hip
-        tall = ((REACH * length) ** 2 - off[:, :2].square().sum(-1)).clamp_min(0.0).sqrt()
-        short = torch.maximum(short, -off[:, 2] - tall)
-    down = torch.tensor(smooth_lift(short.clamp(0.0, DOWN_M).numpy(), fps, 0.5 * ROLL_S))
-    t = torch.arange(len(root), dtype=root.dtype) / fps
-    near = (torch.minimum(t, t[-1] - t) / ROLL_S).clamp(0.0, 1.0)
-    out = root.clone()
+        tall = np.sqrt(np.maximum((REACH * length) ** 2 - np.square(off[:, :2]).sum(-1), 0.0))
+        short = np.maximum(short, -off[:, 2] - tall)
+    down = smooth_lift(np.clip(short, 0.0, DOWN_M), fps, 0.5 * ROLL_S)
+    t = np.arange(len(root), dtype=root.dtype) / fps
+    near = np.clip(np.minimum(t, t[-1] - t) / ROLL_S, 0.0, 1.0)
+    out = root.copy()
     out[:, 2] -= down * smoothstep(near)
     return out
 
@@ -564,12 +588,12 @@ def _lowered(
 def lock_feet(
     skeleton: Skeleton,
     feet: Sequence[int],
-    root: Tensor,
-    rot: Tensor,
-    contact: Tensor,
-    free: Tensor,
+    root: np.ndarray,
+    rot: np.ndarray,
+    contact: np.ndarray,
+    free: np.ndarray,
     fps: float,
-) -> Tensor:
+) -> np.ndarray:
     """Rotations `(T, J, 4)` with the feet held still while they stand; the root's path stays.
 
     A network may say that a foot stands all through a gap while the keyframes at its ends have the foot
@@ -585,24 +609,24 @@ def lock_feet(
     """
     soles, gap = _soles(skeleton, feet), _gap(free)
     if not soles:
-        return rot.clone()
+        return rot.copy()
 
-    def ends(rot: Tensor) -> Tensor:
+    def ends(rot: np.ndarray) -> np.ndarray:
         """`(T, K, 2, 3)` m, ankles and toes in the gap."""
         pos = skeleton.forward(root[gap], rot[gap])[0]
         return pos[:, [[s.ankle, s.toe] for s in soles]]
 
-    def stands() -> Tensor:
+    def stands() -> np.ndarray:
         """`(T, K)` bool, on either end, in the gap."""
-        return torch.stack([contact[gap][:, list(s.columns)].any(1) for s in soles], 1)
+        return np.stack([contact[gap][:, list(s.columns)].any(1) for s in soles], 1)
 
     if gap is not None:
-        contact = contact.clone()
+        contact = contact.copy()
         steps = missing_steps(ends(rot), stands(), fps)
         contact[gap] = stepping(contact[gap], steps, [s.columns for s in soles])
-    bears = (contact[1:] & contact[:-1]).to(rot.dtype) * FIRM
+    bears = (contact[1:] & contact[:-1]).astype(rot.dtype) * FIRM
 
-    def standing(pos: Tensor, _: Tensor) -> dict[int, StandingFoot]:
+    def standing(pos: np.ndarray, _: np.ndarray) -> dict[int, StandingFoot]:
         return {
             s.ankle: StandingFoot(
                 Sole(pos[:, s.ankle], pos[:, [s.ankle, s.toe]]), bears[:, list(s.columns)]
@@ -633,26 +657,26 @@ def _soles(skeleton: Skeleton, feet: Sequence[int]) -> list[_Foot]:
     return out
 
 
-def _gap(free: Tensor) -> slice | None:
+def _gap(free: np.ndarray) -> slice | None:
     """The free frames with the last kept frame before and the first one after them, if there are."""
-    inside = free.nonzero().squeeze(-1)
+    inside = np.flatnonzero(free)
     if len(inside) == 0 or inside[0] == 0 or inside[-1] == len(free) - 1:
         return None
     return slice(int(inside[0]) - 1, int(inside[-1]) + 2)
 
 
 def _raised(
-    skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor, up: Tensor, gap: slice
-) -> Tensor:
+    skeleton: Skeleton, soles: list[_Foot], root: np.ndarray, rot: np.ndarray, up: np.ndarray, gap: slice
+) -> np.ndarray:
     """The motion with its feet raised by `up (T, K)` m in the gap."""
-    nothing = torch.zeros(len(up), dtype=rot.dtype)
-    level = torch.tensor([1.0, 0.0, 0.0], dtype=rot.dtype).expand(len(up), 3)
+    nothing = np.zeros(len(up), dtype=rot.dtype)
+    level = np.broadcast_to(np.array([1.0, 0.0, 0.0], dtype=rot.dtype), (len(up), 3))
     leads = {
-        sole.ankle: Lead(torch.stack((nothing, nothing, up[:, k]), -1), nothing, nothing, level)
+        sole.ankle: Lead(np.stack((nothing, nothing, up[:, k]), -1), nothing, nothing, level)
         for k, sole in enumerate(soles)
         if bool(up[:, k].any())
     }
-    rot = rot.clone()
+    rot = rot.copy()
     if leads:
         rot[gap] = led(skeleton, rot[gap], root[gap], leads)
     return rot

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
@@ -152,14 +150,16 @@ SOFT_M = 0.03
 BALLS = 7
 
 
-def balls(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def balls(
+    table: BodyTable, pos: np.ndarray, quat: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A body as balls: centres `(T, K, 3)` m in the world, radii `(K,)` m and their rows `(K,)`."""
-    centres: list[Tensor] = []
+    centres: list[np.ndarray] = []
     radii: list[float] = []
     rows: list[int] = []
     for i, row in enumerate(table.rows):
         for geom in row.geoms:
-            size, turn = geom.size, torch.tensor(geom.quat, dtype=pos.dtype)
+            size, turn = geom.size, np.array(geom.quat)
             local, radius = [(0.0, 0.0, 0.0)], size[0]
             if geom.kind == "capsule":
                 local = [(0.0, 0.0, float(z)) for z in np.linspace(-size[1], size[1], BALLS)]
@@ -167,11 +167,11 @@ def balls(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[np.ndarray, np.n
                 # Its surface is as far out as the half sizes.
                 local, radius = list(itertools.product(*((-x, 0.0, x) for x in size))), 0.0
             for at in local:
-                inner = carried(torch.tensor(geom.pos, dtype=pos.dtype), turn, at)
+                inner = carried(np.array(geom.pos), turn, at)
                 centres.append(carried(pos[:, i], quat[:, i], inner))
                 radii.append(radius)
                 rows.append(i)
-    return torch.stack(centres, 1).numpy(), np.array(radii), np.array(rows)
+    return np.stack(centres, 1), np.array(radii), np.array(rows)
 
 
 def rectangle(
@@ -307,8 +307,8 @@ class Solid:
         bears: `(K,)` which balls may rest on something.
     """
 
-    def __init__(self, table: BodyTable, pos: Tensor, quat: Tensor, fps: float):
-        self.table, self.fps, self.pos = table, fps, pos.numpy()
+    def __init__(self, table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float):
+        self.table, self.fps, self.pos = table, fps, pos
         self.centres, self.radii, self.rows = balls(table, pos, quat)
         # Of thighs, what is at the hips sits.
         away = np.linalg.norm(self.centres[0] - self.pos[0, self.rows], axis=-1)

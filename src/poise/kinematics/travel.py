@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from poise.body import BodyTable, generate_table
 from poise.errors import PoiseError
@@ -85,12 +84,12 @@ class Fit(NamedTuple):
     left: float
 
 
-def bearing_of(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float) -> Bearing:
+def bearing_of(table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float) -> Bearing:
     """A point bears the more surely the lower it is: in its frame, and over the floor of the clip."""
     weights, velocities, places = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     spins, sizes = list[np.ndarray](), list[np.ndarray]()
     rows = [i for i, r in enumerate(table.rows) if r.kind in BEARS]
-    limbs = [extreme_points(table, pos, quat, [i]).numpy() for i in rows]
+    limbs = [extreme_points(table, pos, quat, [i]) for i in rows]
     middles = [0.5 * (p[1:] + p[:-1]) for p in limbs]
     floors = [float(np.quantile(m[..., 2].min(-1), 0.05)) for m in middles]
     floor = min(floors, default=0.0)
@@ -303,12 +302,12 @@ def find_travel(clip: Clip, table: BodyTable | None = None) -> Travel | None:
             return None
     joints = [r.joint for r in table.rows]
     pos, quat = (x[:, joints] for x in clip.world())
-    return told_by(table, torch.tensor(pos), torch.tensor(quat), clip.fps)
+    return told_by(table, pos, quat, clip.fps)
 
 
-def told_by(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float) -> Travel | None:
+def told_by(table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float) -> Travel | None:
     """`find_travel` of a body with rows in the world poses `pos (T, B, 3)` m, `quat (T, B, 4)`."""
-    root = pos[:, 0, :2].numpy()
+    root = pos[:, 0, :2]
     if len(root) < 4 or np.ptp(root, axis=0).max() > STRAYS_M:
         return None
     bearing = bearing_of(table, pos, quat, fps)
@@ -324,13 +323,13 @@ def told_by(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float)
     return _described(best, bearing, centre, fps)
 
 
-def _stays(fit: Fit, root: np.ndarray, quat: torch.Tensor, seconds: float) -> bool:
+def _stays(fit: Fit, root: np.ndarray, quat: np.ndarray, seconds: float) -> bool:
     """Whether the root ends where it began, and turned as it began, beside what was taken out."""
     way = float(np.linalg.norm(root[-1] - root[0]))
     if way > STAYS * seconds * max(math.hypot(*fit.twist[:2]), SLOWEST):
         return False
     turned = heading_quat(quat_mul(quat, quat_conj(quat[:1])))
-    heading = np.unwrap(2 * np.arctan2(turned[:, 3].numpy(), turned[:, 0].numpy()))
+    heading = np.unwrap(2 * np.arctan2(turned[:, 3], turned[:, 0]))
     turns = abs(fit.twist[2]) * seconds
     # A heading that turns alone means a path that bends, of which the speed alone was taken out.
     return abs(float(heading[-1] - heading[0])) <= max(STAYS * turns, TURNED)
@@ -415,7 +414,7 @@ def moved_by(clip: Clip, place: np.ndarray, angle: np.ndarray) -> Clip:
     root = np.stack((c * x - s * y, s * x + c * y, z), -1) + place
     if not angle.any():
         return clip.replaced(root_pos=root)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    up = np.array([0.0, 0.0, 1.0], dtype=float)
     rot = np.array(clip.rot)
-    rot[:, 0] = quat_mul(axis_angle_to_quat(up, torch.tensor(angle)), torch.tensor(rot[:, 0])).numpy()
+    rot[:, 0] = quat_mul(axis_angle_to_quat(up, angle), rot[:, 0])
     return clip.replaced(root_pos=root, rot=rot)

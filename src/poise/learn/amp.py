@@ -191,6 +191,18 @@ def style_reward(logit: Tensor, config: AmpConfig) -> Tensor:
     return config.scale * functional.softplus(logit).clamp_max(-math.log(LEAST))
 
 
+def mixed_reward(task: Tensor, style: Tensor, config: AmpConfig) -> tuple[Tensor, Tensor]:
+    """r of r_task and r_style, any shape, see `Amp` and `AmpConfig.product`; and the mean r_style, for
+    which r_style counts where it is NaN."""
+    known = style[~style.isnan()]
+    mean = known.mean() if len(known) else style.new_zeros(())
+    style = torch.where(style.isnan(), mean, style)
+    if config.product:
+        return task * style, mean
+    # r = w_task r_task + w_style r_style
+    return config.task_weight * task + config.style_weight * style, mean
+
+
 def adversarial_loss(agent: Tensor, demo: Tensor, loss: Loss) -> Tensor:
     """1/2 of the losses of logits of the character `(M,)` and of the clips `(N,)`; a scalar."""
     if loss == "least_squares":
@@ -218,6 +230,9 @@ class Amp:
         config: the settings.
         seed: seeds the weights and all draws, each apart.
         comm: the processes that train together; the same as the trainer's.
+
+    Attributes:
+        style_rewards: `(T, N)`, r_style of each step of this rollout; NaN before a window is full.
     """
 
     def __init__(
@@ -241,7 +256,7 @@ class Amp:
         self.history = History(source.num_envs, config.frames, features, device)
         self.replay = WindowBuffer(config.replay, width, device)
         self.demo_buffer = WindowBuffer(config.demos, width, device)
-        self._style = torch.zeros(0, source.num_envs, device=device)
+        self.style_rewards = torch.zeros(0, source.num_envs, device=device)
         self._kept: list[Tensor] = []
         self._step = self._horizon = 0
         self._mean_style = 0.0
@@ -260,7 +275,9 @@ class Amp:
     def begin(self, horizon: int) -> None:
         """See `Style`."""
         self._kept, self._step, self._horizon = [], 0, horizon
-        self._style = self._style.new_full((horizon, self._style.shape[1]), math.nan)
+        self.style_rewards = self.style_rewards.new_full(
+            (horizon, self.style_rewards.shape[1]), math.nan
+        )
 
     @torch.no_grad()
     def step(self, done: Tensor) -> None:
@@ -271,7 +288,7 @@ class Amp:
         full = self.history.full()
         if len(full):
             windows = self.history.windows(full)
-            self._style[self._step, full] = style_reward(self.net(windows), self.config)
+            self.style_rewards[self._step, full] = style_reward(self.net(windows), self.config)
             # As many of each step that the whole rollout gives what is wanted.
             share = math.ceil(self.config.kept / self._horizon)
             pick = torch.randperm(len(full), generator=self.rng)[:share]
@@ -283,15 +300,9 @@ class Amp:
 
     def reward(self, task: Tensor) -> Tensor:
         """See `Style`; where a window is not yet full, the style counts as its mean."""
-        style, config = self._style, self.config
-        known = style[~style.isnan()]
-        mean = known.mean() if len(known) else style.new_zeros(())
+        total, mean = mixed_reward(task, self.style_rewards, self.config)
         self._mean_style = float(mean)
-        style = torch.where(style.isnan(), mean, style)
-        if config.product:
-            return task * style
-        # r = w_task r_task + w_style r_style
-        return config.task_weight * task + config.style_weight * style
+        return total
 
     def update(self) -> dict[str, float]:
         """Some gradient steps on what the rollout showed; see `Style`.
@@ -300,7 +311,7 @@ class Amp:
             TrainingError: a number is not finite; the weights from before are put back.
         """
         config, net = self.config, self.net
-        agent = torch.cat(self._kept) if self._kept else self._style.new_zeros(0, net.net.num_in)
+        agent = torch.cat(self._kept) if self._kept else self.style_rewards.new_zeros(0, net.net.num_in)
         demos = self._demos()
         if any_of(self.comm, len(agent) == 0):
             # No character has moved for W frames yet, so there is nothing to tell apart.
@@ -311,7 +322,7 @@ class Amp:
             shown = agent[self._draw(len(agent))]
             if len(self.replay):
                 shown = torch.cat((shown, self.replay.sample(len(shown), self.rng)))
-            for name, value in self._fit(shown, self._some(demos, config.minibatch)).items():
+            for name, value in self.descend(shown, self._some(demos, config.minibatch)).items():
                 total[name] += value / config.steps
         total["style_reward"] = self._mean_style
         params = sum(float(p.detach().sum()) for p in net.parameters())
@@ -331,8 +342,9 @@ class Amp:
         self._kept = []
         return self._means(total)
 
-    def _fit(self, agent: Tensor, demo: Tensor) -> dict[str, float]:
-        """One gradient step on raw windows `(M, W F)` each."""
+    def descend(self, agent: Tensor, demo: Tensor) -> dict[str, float]:
+        """One gradient step of the loss L on raw windows `(M, W F)` of the character and of the clips;
+        its numbers for the log, before the step."""
         config, net = self.config, self.net
         penalty, real = gradient_penalty(net, net.normalise(demo))
         fake = net(agent)
@@ -359,11 +371,11 @@ class Amp:
 
     def _draw(self, size: int) -> Tensor:
         index = torch.randint(size, (self.config.minibatch,), generator=self.rng)
-        return index.to(self._style.device)
+        return index.to(self.style_rewards.device)
 
     def _fresh(self, count: int) -> Tensor:
         """New demos `(count, W F)`."""
-        width, device = self.net.net.num_in, self._style.device
+        width, device = self.net.net.num_in, self.style_rewards.device
         drawn = self.demos(count, self.rng)
         if drawn.numel() != count * width:
             raise PoiseError(

@@ -540,14 +540,22 @@ class BetweenObjective:
         )
         for name, gap in (("", first), ("refined_", refined)):
             if gap is not None:
-                own = self._parts(gap, truth, batch, known)
+                own = self.parts(gap, truth, batch, known)
                 total = total + sum(getattr(self.config, k) * v for k, v in own.items())
                 parts |= {f"{name}{k}": v for k, v in own.items()}
         return total, {k: v.detach() for k, v in parts.items()}
 
-    def _parts(
+    def parts(
         self, gap: GapFrames, truth: tuple[Tensor, Tensor], batch: Windows, known: Tensor
     ) -> dict[str, Tensor]:
+        """The parts of the loss before their weights, scalars: of positions, turns and velocities in
+        standard deviations, of contacts, and m a frame that feet slide where contact is said.
+
+        Args:
+            gap: what the network made. batch: the windows.
+            truth: their joints' places `(N, L, J, 3)` m and turns `(N, L, J, 3, 3)` in the world.
+            known: `(L,)` bool, frames that were given.
+        """
         layout, hidden = self.net.layout, ~known
         pos, mats = matrix_kinematics(layout.parents, batch.offsets.unsqueeze(1), gap.root, gap.mats)
         error = (pos - truth[0]) / self.std

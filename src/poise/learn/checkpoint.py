@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Concatenate, Literal, ParamSpec, TypedDict, TypeVar
 
+import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as parse_tensors
@@ -248,6 +249,11 @@ State = dict[str, Tensor]
 def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> State:
     """The tensors as clones under "prefix/name"."""
     return {f"{prefix}/{k}": v.detach().clone() for k, v in tensors.items()}
+
+
+def tensors_of(arrays: Mapping[str, np.ndarray]) -> State:
+    """NumPy arrays as tensors, by their names."""
+    return {k: torch.from_numpy(v) for k, v in arrays.items()}
 
 
 def under(prefix: str, tensors: Mapping[str, Tensor]) -> State:

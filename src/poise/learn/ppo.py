@@ -439,7 +439,7 @@ class PPO:
                 obs = obs.bfloat16()
         mean, std = moments(self.comm, advantage)
         target = self.return_norm(rollout.returns.view(-1, 1))
-        batch = _Batch(obs, (advantage - mean) / (std + 1e-8), target, old, context, self._near(obs))
+        batch = _Batch(obs, (advantage - mean) / (std + 1e-8), target, old, context, self.near(obs))
         parts = max(1, round(rollout.samples * self.comm.size / config.minibatch))
         # Processes that share gradients make the same calls in the same order, so in one thread.
         parallel = parallel and self.comm.size == 1
@@ -465,7 +465,7 @@ class PPO:
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
         return {name: sum(m[name] for m in means) / len(means) for name in means[0]}, kl
 
-    def _near(self, obs: Tensor) -> Tensor | None:
+    def near(self, obs: Tensor) -> Tensor | None:
         """`(NEAR, O)` by which states near those of the batch lie off them; None where none are seen."""
         if not self.config.smooth_weight:
             return None

@@ -46,9 +46,14 @@ class Guard:
     refused: Counter[str] = field(default_factory=Counter)
     _open: Counter[str] = field(default_factory=Counter)
 
+    @property
+    def inside(self) -> int:
+        """Connections that were counted in and not out."""
+        return self._open.total()
+
     def enter(self, address: str) -> str | None:
         """Counts a connection in; the reason why it may not come, else None."""
-        if self._open.total() >= ALL:
+        if self.inside >= ALL:
             return self._no("too many connections")
         if self._open[address] >= EACH:
             return self._no("too many connections from this address")

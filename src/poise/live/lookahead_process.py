@@ -153,6 +153,11 @@ class AheadBeside:
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
+    @property
+    def decides(self) -> bool:
+        """Whether something is being decided, so that nothing else is asked."""
+        return self._waiting and self._told.empty()
+
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
         """See `AheadAtOnce`. A question of before is not waited for."""
         self._env, self._worlds = env, {k: _LookingCharacter() for k in worlds}

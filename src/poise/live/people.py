@@ -16,11 +16,11 @@ from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.kinematics import RetargetConfig, place_on_body
 from poise.kinematics.coords import Hinges, wrapped
-from poise.kinematics.retarget.passage import Retargeter, doublings, world_of
+from poise.kinematics.retargeting.passage import Retargeter, doublings, world_of
 from poise.kinematics.stream_noise import FadingFilter
 from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, StreamPose, StreamTremble, leapt
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import ahead_angle, normalize, quat_mul, quat_rotate, yaw_quat
 
 #: s that are stood, m that the root may move meanwhile, and frames a second of what is measured.
 STAND_S, STILL_M, RATE = 2.0, 0.25, 30.0
@@ -42,21 +42,21 @@ class Offset:
 
     def __call__(self, qpos: np.ndarray) -> np.ndarray:
         """Coordinates `(7 + n)` there."""
-        out, turn = qpos.copy(), q.yaw(self.yaw)
-        out[:3] = q.rotate(turn, qpos[:3]) + self.shift
-        out[3:7] = q.mul(turn, qpos[3:7])
+        out, turn = qpos.copy(), yaw_quat(self.yaw)
+        out[:3] = quat_rotate(turn, qpos[:3]) + self.shift
+        out[3:7] = quat_mul(turn, qpos[3:7])
         return out
 
     def points(self, places: np.ndarray) -> np.ndarray:
         """Points `(..., 3)` m there."""
-        return q.rotate(q.yaw(self.yaw), places) + self.shift
+        return quat_rotate(yaw_quat(self.yaw), places) + self.shift
 
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
         """Lets the motion go on so that the coordinates `seen (7 + n)` are where and face as `to
         (7 + n)` does; heights stay."""
-        turn = q.heading(to[3:7]) - q.heading(seen[3:7])
+        turn = ahead_angle(to[3:7]) - ahead_angle(seen[3:7])
         flat = np.append(seen[:2], 0.0)
-        self.shift = q.rotate(q.yaw(turn), self.shift - flat) + np.append(to[:2], 0.0)
+        self.shift = quat_rotate(yaw_quat(turn), self.shift - flat) + np.append(to[:2], 0.0)
         self.yaw = math.remainder(self.yaw + turn, 2 * math.pi)
 
 
@@ -106,7 +106,7 @@ class Calibration:
         """
         on = place_on_body(clip, humanoid.table, example, RATE, how=how, near=humanoid)
         passage = Retargeter.between(clip, example, factor=None if how is None else how.scale)
-        feet = {j: turn.numpy() for j, turn in on.level.turns.items()}
+        feet = dict(on.level.turns)
         hinges = Hinges(example.skeleton, humanoid.table)
         out = cls(passage, hinges, feet, ease[7:])
         step = max(1, clip.frames // 60)
@@ -123,7 +123,7 @@ class Calibration:
         """Coordinates `(7 + n)` of a pose, on the floor."""
         root, world = self.passage(root_pos, world_of(self.passage.source, rot))
         for joint, turn in self.feet.items():
-            world[joint] = q.mul(world[joint], turn)
+            world[joint] = quat_mul(world[joint], turn)
         last = self.first if self._last is None else self._last
         qpos = self.hinges(root, world, last)
         self._last = qpos[7:].copy()
@@ -246,7 +246,7 @@ class Steady:
         return np.concatenate((self._last.ravel(), root))
 
     def _rotations(self, x: np.ndarray) -> np.ndarray:
-        return q.normalized(x[:-3].reshape(-1, 4))
+        return normalize(x[:-3].reshape(-1, 4))
 
     def _begun(self, rot: np.ndarray) -> FadingFilter:
         count = len(self.skeleton)
@@ -268,7 +268,7 @@ class Steady:
         skeleton = self.skeleton
         world = world_of(skeleton, channels[:, :-3].reshape(len(channels), -1, 4))
         above = np.maximum(skeleton.parents, 0)
-        out = q.rotate(world[:, above], np.asarray(skeleton.offsets))
+        out = quat_rotate(world[:, above], np.asarray(skeleton.offsets))
         out[:, 0] = channels[:, -3:]
         for joints, parents in doublings(tuple(skeleton.parents)):
             out[:, joints] = out[:, parents] + out[:, joints]

@@ -15,7 +15,7 @@ import numpy as np
 from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.formats.point_fit import fit_clip
-from poise.kinematics.retarget.keypoint_goal import Gaps, PointBody
+from poise.kinematics.retargeting.keypoint_goal import Gaps, PointBody
 from poise.kinematics.stream_noise import FadingFilter, of_points
 from poise.live.people import FEWEST, FORGET_S, STAND_S, STILL_M
 from poise.live.sources import KeypointFrame
@@ -83,10 +83,10 @@ class Performer:
         skeleton, places = self._whole.skeleton, None
         if self._tells_places:
             pos, root, rot = self._body.follow(whole[None])
-            places = pos[0].numpy()
+            places = pos[0]
         else:
             root, rot = self._body.performer(whole[None])
-        at, turned = root[0].numpy(), rot[0].numpy()
+        at, turned = root[0], rot[0]
         held = tremble.late_s
         return Packet(self.person, time_s, skeleton, at, turned, self._whole, places, tremble, held)
 

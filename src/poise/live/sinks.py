@@ -20,12 +20,12 @@ from poise.formats import read_clip, write_clip
 from poise.formats.own import csv_text
 from poise.formats.table import check_writable
 from poise.kinematics import qpos_to_clip
-from poise.kinematics.retarget.passage import Retargeter, local_of, world_of
+from poise.kinematics.retargeting.passage import Retargeter, local_of, world_of
 from poise.live.people import Own
 from poise.live.vmc import NEEDED, PARENTS, datagram, standard, t_pose
 from poise.live.world import LiveStep
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import normalize, quat_between, quat_mul, quat_rotate, slerp, yaw_quat
 
 #: Frames that wait for the disk at most, and s between two writes.
 WAIT, EVERY_S = 900, 0.4
@@ -197,14 +197,14 @@ class Puppet:
             elif j in self._above:
                 world[j] = first
             else:
-                world[j] = q.mul(world[parent], self._rot[j])
+                world[j] = quat_mul(world[parent], self._rot[j])
         pelvis = next(iter(self._row))
         root = bodies[0, :3].astype(float)
         # The root is where the pelvis is, less what lies between them.
         path = [*own.ancestors(pelvis)[::-1], pelvis]
         for a, b in pairwise(path):
-            root = root - q.rotate(world[a], own.offsets[b])
-        return self._passage(root, q.normalized(world))
+            root = root - quat_rotate(world[a], own.offsets[b])
+        return self._passage(root, normalize(world))
 
 
 class OwnPuppet:
@@ -236,14 +236,14 @@ class OwnPuppet:
         hips, world = puppet.world(bodies)
         if own is not None and goals is not None:
             was, there = puppet.world(goals)
-            turn = q.yaw(own.where.yaw)
-            place = q.rotate(turn, own.root_pos) + own.where.shift / own.factor
-            self._turn = q.between(there, q.mul(turn, world_of(own.skeleton, own.rot)))
+            turn = yaw_quat(own.where.yaw)
+            place = quat_rotate(turn, own.root_pos) + own.where.shift / own.factor
+            self._turn = quat_between(there, quat_mul(turn, world_of(own.skeleton, own.rot)))
             self._move = place - was
         else:
             none = _nothing(puppet.skeleton)[0]
-            self._turn = q.slerp(self._turn, none, np.full(len(none), FADES))
-        return puppet.skeleton, hips + self._move, local_of(puppet.skeleton, q.mul(world, self._turn))
+            self._turn = slerp(self._turn, none, np.full(len(none), FADES))
+        return puppet.skeleton, hips + self._move, local_of(puppet.skeleton, quat_mul(world, self._turn))
 
     def _take(self, own: Own) -> None:
         """Goes on with the person's model."""

@@ -23,7 +23,7 @@ from poise.live.protocol import (
 )
 from poise.live.stream import PEOPLE, Inbox, Packet
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import ahead_angle, quat_mul, quat_rotate, slerp, yaw_quat
 
 #: Takes a frame of keypoints; returns at once.
 Takes = Callable[["KeypointFrame"], None]
@@ -49,9 +49,9 @@ class Loop:
         self.fade = min(round(FADE_S * clip.fps), (clip.frames - 1) // 2)
         self.first, self.last = _seam(clip, self.fade)
         # By how much each round is turned and moved against the one before.
-        self._turn = q.heading(clip.rot[self.last, 0]) - q.heading(clip.rot[self.first, 0])
-        turn = q.yaw(self._turn)
-        move = clip.root_pos[self.last] - q.rotate(turn, clip.root_pos[self.first])
+        self._turn = ahead_angle(clip.rot[self.last, 0]) - ahead_angle(clip.rot[self.first, 0])
+        turn = yaw_quat(self._turn)
+        move = clip.root_pos[self.last] - quat_rotate(turn, clip.root_pos[self.first])
         self._move = np.array([move[0], move[1], 0.0])
 
     def __call__(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -64,14 +64,14 @@ class Loop:
             was, turned = self._of(rounds, self.last + at)
             share = (at + 1) / (self.fade + 1)
             root = was + share * (root - was)
-            rot = q.slerp(turned, rot, share)
+            rot = slerp(turned, rot, share)
         return root, rot
 
     def _of(self, rounds: int, at: int) -> tuple[np.ndarray, np.ndarray]:
         angle = self._turn * rounds
         root, rot = self.clip.root_pos[at], self.clip.rot[at].copy()
-        rot[0] = q.mul(q.yaw(angle), rot[0])
-        return q.rotate(q.yaw(angle), root) + self._moved(rounds), rot
+        rot[0] = quat_mul(yaw_quat(angle), rot[0])
+        return quat_rotate(yaw_quat(angle), root) + self._moved(rounds), rot
 
     def _moved(self, rounds: int) -> np.ndarray:
         """sum over k < rounds of R^k m, for R the turn of one round."""
@@ -98,7 +98,7 @@ def _seam(clip: Clip, fade: int) -> tuple[int, int]:
         rows = list[np.ndarray]()
         for frame in np.concatenate((at, np.minimum(at + round(0.1 * clip.fps), clip.frames - 1))):
             rot = clip.rot[frame].copy()
-            rot[0] = q.mul(q.yaw(-q.heading(rot[0])), rot[0])
+            rot[0] = quat_mul(yaw_quat(-ahead_angle(rot[0])), rot[0])
             rot *= np.where(rot[:, :1] < 0, -1.0, 1.0)
             rows.append(np.append(rot, clip.root_pos[frame, 2]))
         return np.stack(rows).reshape(2, len(at), -1).swapaxes(0, 1).reshape(len(at), -1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import normalize, slerp
 
 #: Packets of one person that wait at most; the newest win.
 WAIT = 64
@@ -95,7 +95,7 @@ def checked(packet: Packet) -> Packet:
         raise PoiseError("too far away", packet.person, code="too-far")
     if not 0 < len(packet.person) <= NAME:
         raise PoiseError("name", packet.person[:NAME], code="not-a-name")
-    return replace(packet, rot=q.normalized(packet.rot))
+    return replace(packet, rot=normalize(packet.rot))
 
 
 class Smooths(Protocol):
@@ -341,7 +341,7 @@ class JitterBuffer:
         if a.places is not None and b.places is not None:
             places = a.places + share * (b.places - a.places)
         root = a.root_pos + share * (b.root_pos - a.root_pos)
-        return StreamPose(root, q.slerp(a.rot, b.rot, share), stale, jumped, places, stalled)
+        return StreamPose(root, slerp(a.rot, b.rot, share), stale, jumped, places, stalled)
 
     def _kept_back(self, now_s: float) -> float:
         """s, that of the tremble; it comes and goes gently."""

@@ -14,7 +14,7 @@ from poise.errors import PoiseError
 from poise.live.sockets import Listener
 from poise.live.stream import Inbox, Packet
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
+from poise.motion.rotations import normalize, quat_mul, quat_rotate
 
 #: Bones with their parents, from the hips on; fingers, eyes and jaw are left out.
 PARENTS: dict[str, str | None] = {
@@ -285,9 +285,9 @@ class Avatar:
         skeleton, pos, rot = self._body(bones)
         self._known = frozenset(bones)
         root_pos, root_rot = from_unity(self._root[:3], self._root[3:])
-        root_rot = q.normalized(root_rot)
-        rot[0] = q.mul(root_rot, rot[0])
-        place = root_pos + q.rotate(root_rot, pos[0])
+        root_rot = normalize(root_rot)
+        rot[0] = quat_mul(root_rot, rot[0])
+        place = root_pos + quat_rotate(root_rot, pos[0])
         # A clock that stands still is none.
         at = now_s if time_s is None or not np.isfinite(time_s) or time_s <= 0 else time_s
         return [Packet(self.person, at, skeleton, place, rot)]

@@ -148,6 +148,7 @@ class LiveWorld:
         unwound: how often a fallen character's hinges were whole turns off.
         hurries: whether there is no time to look ahead; all act at once then.
         looked: control steps in which a character looked ahead.
+        ahead: looks ahead for those that do; None before one does.
 
     Raises:
         PoiseError: a policy that cannot get up, or has no critic though it is to look ahead.
@@ -198,7 +199,7 @@ class LiveWorld:
         self._read = [deque[Own | None](maxlen=READ) for _ in range(count)]
         self.hurries, self.looked = False, 0
         self._act = tracker.policy.act
-        self._ahead: AheadAtOnce | AheadBeside | None = None
+        self.ahead: AheadAtOnce | AheadBeside | None = None
         self._beside, self._seed = beside, seed
         if lookahead and tracker.value is None:
             raise PoiseError(
@@ -210,10 +211,10 @@ class LiveWorld:
     def look_ahead(self, characters: tuple[int, ...]) -> None:
         """Which characters look ahead; the others act at once."""
         self.ahead_of = tuple(k for k in characters if 0 <= k < self.count)
-        if self._ahead is None and self.ahead_of and self.can_look_ahead:
-            self._ahead = (AheadBeside if self._beside else AheadAtOnce)(self.tracker, self._seed)
-        if self._ahead is not None:
-            self._ahead.watch(self.env, self.ahead_of)
+        if self.ahead is None and self.ahead_of and self.can_look_ahead:
+            self.ahead = (AheadBeside if self._beside else AheadAtOnce)(self.tracker, self._seed)
+        if self.ahead is not None:
+            self.ahead.watch(self.env, self.ahead_of)
 
     @property
     def can_look_ahead(self) -> bool:
@@ -299,9 +300,9 @@ class LiveWorld:
         goal.aim(None, None)
         goal.notes.clear()
         obs = env.observe()
-        ahead = self._ahead if self.ahead_of and not self.hurries else None
-        if self._ahead is not None and ahead is None:
-            self._ahead.skip()
+        ahead = self.ahead if self.ahead_of and not self.hurries else None
+        if self.ahead is not None and ahead is None:
+            self.ahead.skip()
         env.drive(self._act(obs) if ahead is None else ahead.act(obs))
         self.looked += ahead is not None and ahead.acts
         env.controls.step(env.backend, self.substeps)
@@ -310,13 +311,13 @@ class LiveWorld:
         goal.at += 1
         goal.aim(None, None)
         self.steps += 1
-        self._unwind()
+        self.unwind()
         if bool(self.rows.unstable().any()) or not bool(self.rows.state.qpos.isfinite().all()):
             self.resets += 1
             self._set_down()
         return self._seen()
 
-    def _unwind(self) -> None:
+    def unwind(self) -> None:
         """Whole turns that a fall has made of a hinge are left out: the pose is the same, and nothing is
         turned back all round where the character gets up."""
         state = self.rows.state
@@ -351,5 +352,5 @@ class LiveWorld:
     def close(self) -> None:
         """Frees the simulations."""
         self.env.close()
-        if self._ahead is not None:
-            self._ahead.close()
+        if self.ahead is not None:
+            self.ahead.close()

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from poise.errors import PoiseError
-from poise.metrics.tracking_errors import MM, PHC_FPS, masked_mean, masked_quantile, span_mask
+from poise.metrics.tracking_errors import MM, PHC_FPS, masked_mean, masked_quantile, span_mask, steps
 from poise.motion.rotations import GRAVITY
+from poise.motion.vectors import Array, floored, limited, lower_median, namespace, norm, sliding
 
 CONTACT_HEIGHT = 0.02
 """m; a foot point above this is not in contact."""
@@ -39,23 +39,24 @@ class Penetration(NamedTuple):
         share: of the frames below the ground.
     """
 
-    mean_mm: Tensor
-    max_mm: Tensor
-    share: Tensor
+    mean_mm: Any
+    max_mm: Any
+    share: Any
 
 
-def _full(mask: Tensor | None, like: Tensor) -> Tensor:
-    return torch.ones_like(like, dtype=torch.bool) if mask is None else mask.expand_as(like)
+def _full(mask: Array | None, like: Array) -> Array:
+    xp = namespace(like)
+    return xp.ones_like(like, dtype=xp.bool) if mask is None else xp.broadcast_to(mask, like.shape)
 
 
 def foot_contacts(
-    foot_points: Tensor,
+    foot_points: Array,
     fps: float,
     *,
     height: float = CONTACT_HEIGHT,
     ground: float = 0.0,
-    mask: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+    mask: Array | None = None,
+) -> tuple[Array, Array]:
     """Horizontal speed in mm/s and contact of each foot point between frames, both `(..., T - 1, F)`.
 
     A point `(..., T, F, 3)` is in contact from t to t+1 when it is within `height` m of the ground in
@@ -67,25 +68,25 @@ def foot_contacts(
         raise PoiseError(
             f"foot points must be (..., T, F, 3), got {tuple(foot_points.shape)}", code="wrong-shape"
         )
-    step = torch.diff(foot_points, dim=-3) * fps
-    low = foot_points[..., 2] - ground <= height
-    contact = low[..., 1:, :] & low[..., :-1, :] & (step[..., 2].abs() <= CONTACT_RISE)
+    step = steps(foot_points) * fps
+    low: Any = foot_points[..., 2] - ground <= height
+    contact = low[..., 1:, :] & low[..., :-1, :] & (abs(step[..., 2]) <= CONTACT_RISE)
     if mask is not None:
-        contact = contact & span_mask(mask, 1).unsqueeze(-1)
-    speed = step[..., :2].norm(dim=-1)
+        contact = contact & span_mask(mask, 1)[..., None]
+    speed = norm(step[..., :2])
     planted = contact & (speed <= SWING_SPEED)
-    contact = torch.where(planted.any(-1, keepdim=True), planted, contact)
+    contact = namespace(speed).where(planted.any(-1)[..., None], planted, contact)
     return speed * MM, contact
 
 
 def foot_slide(
-    foot_points: Tensor,
+    foot_points: Array,
     fps: float,
     *,
     height: float = CONTACT_HEIGHT,
     ground: float = 0.0,
-    mask: Tensor | None = None,
-) -> Tensor:
+    mask: Array | None = None,
+) -> Array:
     """Poise's foot slide, mm/s: mean horizontal speed of foot points while in contact; `(...)`.
 
     Contact as in `foot_contacts`; the mean runs over all (frame, point) pairs in contact. NaN
@@ -95,38 +96,38 @@ def foot_slide(
     return masked_mean(speed, contact, (-2, -1))
 
 
-def s2h_foot_penetration(height: Tensor) -> tuple[Tensor, Tensor]:
+def s2h_foot_penetration(height: Array) -> tuple[Array, Array]:
     """Skeleton2Humanoid's FP (mm, negative) and FQ (share) of joint heights `(..., T, J)` in m.
 
     The paper gives no formula; read as the means of `min(0, h)` and `[h < 0]` over all frames and
     the joints handed in (feet for FP and FQ, all joints for JQ).
     """
-    return height.clamp(max=0).mean((-2, -1)) * MM, (height < 0).to(height.dtype).mean((-2, -1))
+    under = namespace(height).astype(height < 0, height.dtype)
+    return limited(height, most=0).mean((-2, -1)) * MM, under.mean((-2, -1))
 
 
-def penetration(lowest: Tensor, mask: Tensor | None = None) -> Penetration:
+def penetration(lowest: Array, mask: Array | None = None) -> Penetration:
     """Depth of the lowest point `(..., T)` m below the ground; results `(...)`.
 
     mean over all valid frames of `max(0, -h)`, frames without penetration counting zero.
     """
     valid = _full(mask, lowest)
-    depth = (-lowest).clamp_min(0) * MM
-    held = torch.where(valid, depth, torch.zeros_like(depth))
-    return Penetration(
-        masked_mean(depth, valid, -1), held.amax(-1), masked_mean((depth > 0).to(depth.dtype), valid, -1)
-    )
+    xp, depth = namespace(lowest), floored(-lowest, 0) * MM
+    held = xp.where(valid, depth, xp.zeros_like(depth))
+    under = masked_mean(xp.astype(depth > 0, depth.dtype), valid, -1)
+    return Penetration(masked_mean(depth, valid, -1), xp.max(held, axis=-1), under)
 
 
-def _window_any(flags: Tensor, half: int) -> Tensor:
+def _window_any(flags: Array, half: int) -> Array:
     """True within `half` frames of a true flag, along the last dim."""
     if half == 0 or flags.shape[-1] == 0:
         return flags
-    flat = flags.reshape(-1, 1, flags.shape[-1]).to(torch.float32)
-    spread = torch.nn.functional.max_pool1d(flat, 2 * half + 1, stride=1, padding=half)
-    return spread.reshape(flags.shape) > 0.5
+    xp = namespace(flags)
+    beside = xp.zeros((*flags.shape[:-1], half), dtype=xp.bool, device=flags.device)
+    return sliding(xp.concat((beside, flags, beside), axis=-1), 2 * half + 1).any(-1)
 
 
-def ballistic(com_height: Tensor, fps: float, mask: Tensor | None = None) -> Tensor:
+def ballistic(com_height: Array, fps: float, mask: Array | None = None) -> Array:
     """Frames `(..., T)` in free flight, told from the centre of mass height `(..., T)` m alone.
 
     A parabola is fitted to every window of `BALLISTIC_WINDOW` (an odd number of frames, at least 3).
@@ -135,17 +136,18 @@ def ballistic(com_height: Tensor, fps: float, mask: Tensor | None = None) -> Ten
     """
     half = max(1, int(BALLISTIC_WINDOW * fps / 2 + 1e-6))
     frames = com_height.shape[-1]
-    flags = torch.zeros_like(com_height, dtype=torch.bool)
+    xp = namespace(com_height)
+    flags = xp.zeros_like(com_height, dtype=xp.bool)
     if frames < 2 * half + 1:
         return flags
     # Savitzky-Golay: z'' = 2 sum_k c_k z_{t+k},  c_k = (k^2 - m) / sum (k^2 - m)^2,  m = mean k^2
-    k2 = torch.arange(-half, half + 1, dtype=com_height.dtype, device=com_height.device).square()
+    k2 = xp.arange(-half, half + 1, dtype=com_height.dtype, device=com_height.device) ** 2
     c = k2 - k2.mean()
-    c = 2.0 * c / c.square().sum() * fps**2
+    c = 2.0 * c / (c * c).sum() * fps**2
     # Heights are taken relative to the window's middle, which keeps float32 exact enough.
-    windows = com_height.unfold(-1, 2 * half + 1, 1)
+    windows = sliding(com_height, 2 * half + 1)
     acceleration = ((windows - windows[..., half : half + 1]) * c).sum(-1)
-    falling = (acceleration + GRAVITY).abs() <= BALLISTIC_TOLERANCE * GRAVITY
+    falling = abs(acceleration + GRAVITY) <= BALLISTIC_TOLERANCE * GRAVITY
     if mask is not None:
         falling = falling & span_mask(mask, 2 * half)
     flags[..., half : frames - half] = falling
@@ -153,18 +155,18 @@ def ballistic(com_height: Tensor, fps: float, mask: Tensor | None = None) -> Ten
 
 
 def float_gaps(
-    lowest: Tensor, com_height: Tensor, fps: float, mask: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+    lowest: Array, com_height: Array, fps: float, mask: Array | None = None
+) -> tuple[Array, Array]:
     """Gap in mm between the lowest point and the ground, and where contact is due, both `(..., T)`.
 
     Contact is due in every frame that is not `ballistic`: nothing but the ground can hold a body
     that does not fall freely.
     """
     due = _full(mask, lowest) & ~ballistic(com_height, fps, mask)
-    return lowest.clamp_min(0) * MM, due
+    return floored(lowest, 0) * MM, due
 
 
-def floating(lowest: Tensor, com_height: Tensor, fps: float) -> Tensor:
+def floating(lowest: Array, com_height: Array, fps: float) -> Array:
     """Mean gap, mm, between the lowest point `(..., T)` m and the ground where contact is due; `(...)`.
 
     See `float_gaps`. Frames that touch count zero; NaN when all frames are in flight.
@@ -172,16 +174,16 @@ def floating(lowest: Tensor, com_height: Tensor, fps: float) -> Tensor:
     return masked_mean(*float_gaps(lowest, com_height, fps), -1)
 
 
-def jerk(pos: Tensor, fps: float) -> Tensor:
+def jerk(pos: Array, fps: float) -> Array:
     """Mean over bodies of `||third difference|| fps^3`, m/s^3; `(..., T, B, 3)` gives `(..., T - 3)`."""
-    return torch.diff(pos, n=3, dim=-3).norm(dim=-1).mean(-1) * fps**3
+    return cast("Any", norm(steps(pos, 3)).mean(-1) * fps**3)
 
 
 #: Bands (Hz) of `detail`: steps, gestures, what is quick.
 DETAIL_HZ = ((0.5, 1.5), (1.5, 3.0), (3.0, 6.0), (6.0, 12.0))
 
 
-def detail(pos: Tensor, ref: Tensor, fps: float) -> dict[str, float]:
+def detail(pos: Array, ref: Array, fps: float) -> dict[str, float]:
     """How much of the reference's movement is left at each frequency: the ratio of the energies of
     bodies `(T, B, 3)` m about the root (body 0), by band ("1.5-3 Hz"). 1 keeps it, less is stiffer, more
     trembles.
@@ -190,20 +192,21 @@ def detail(pos: Tensor, ref: Tensor, fps: float) -> dict[str, float]:
     short or too slow to tell is left out.
     """
     frames = len(pos)
-    hz = torch.fft.rfftfreq(frames, 1.0 / fps) if frames > 3 else torch.zeros(1)
-    t = torch.linspace(-1.0, 1.0, frames, dtype=pos.dtype)
-    basis = torch.stack((torch.ones_like(t), t), 1)
+    hz = np.fft.rfftfreq(frames, 1.0 / fps) if frames > 3 else np.zeros(1)
+    t = np.linspace(-1.0, 1.0, frames)
+    basis = np.stack((np.ones(frames), t), 1)
 
-    def power(p: Tensor) -> Tensor:
+    def power(p: Any) -> np.ndarray:
+        p = np.asarray(p, dtype=float)
         y = (p[:, 1:] - p[:, :1]).reshape(frames, -1)
-        y = y - basis @ torch.linalg.lstsq(basis, y).solution
-        window = torch.hann_window(frames + 2, periodic=False, dtype=p.dtype)[1:-1, None]
-        return torch.fft.rfft(y * window, dim=0).abs().square().sum(1)
+        y = y - basis @ np.linalg.lstsq(basis, y)[0]
+        spectrum = np.fft.rfft(y * np.hanning(frames + 2)[1:-1, None], axis=0)
+        return np.square(np.abs(spectrum)).sum(1)
 
     out = dict[str, float]()
     if frames < 4:
         return out
-    made, asked = power(pos), power(ref.to(pos.dtype))
+    made, asked = power(pos), power(ref)
     for low, high in DETAIL_HZ:
         band = (hz >= low) & (hz < min(high, 0.5 * fps))
         if high - low > 2.0 * fps / frames and bool(band.any()) and float(asked[band].sum()) > 0.0:
@@ -231,20 +234,21 @@ class Deviation(NamedTuple):
 CHANGE_MM, CHANGE_TIMES, CHANGE_S = 60.0, 2.0, 0.1
 
 
-def deviations(pos: Tensor, ref: Tensor, fps: float, most: int = 3) -> list[Deviation]:
+def deviations(pos: Array, ref: Array, fps: float, most: int = 3) -> list[Deviation]:
     """The largest spells in which bodies `(T, B, 3)` m are not where `ref` has them, about body 0, the
     root, in the order of time: each over twice the median distance and `CHANGE_MM`, one body a spell.
 
     most: how many are given at most; spells of other bodies at the same time belong to the larger one.
     """
-    off = ((pos - pos[:, :1]) - (ref - ref[:, :1])).norm(dim=-1) * MM
-    if not off.numel():
+    about = (np.asarray(x, dtype=float) for x in (pos - pos[:, :1], ref - ref[:, :1]))
+    off = norm(next(about) - next(about)) * MM
+    if not off.size:
         return []
-    least = max(CHANGE_MM, CHANGE_TIMES * float(off[:, 1:].median()))
+    least = max(CHANGE_MM, CHANGE_TIMES * float(lower_median(off[:, 1:])))
     found: list[Deviation] = []
-    far, worst = off.max(1)
-    edge = torch.nn.functional.pad((far > least).to(torch.int8), (1, 1)).diff()
-    begins, ends = (edge.eq(k).nonzero()[:, 0].tolist() for k in (1, -1))
+    worst, far = off.argmax(1), off.max(1)
+    edge = np.diff(np.pad(far > least, 1).astype(int))
+    begins, ends = (np.flatnonzero(edge == k).tolist() for k in (1, -1))
     for start, stop in zip(begins, ends, strict=True):
         if stop - start >= CHANGE_S * fps:
             at = start + int(far[start:stop].argmax())
@@ -253,13 +257,13 @@ def deviations(pos: Tensor, ref: Tensor, fps: float, most: int = 3) -> list[Devi
     return sorted(largest, key=lambda c: c.start_s)
 
 
-def smoothness(pos: Tensor, fps: float = PHC_FPS) -> Tensor:
+def smoothness(pos: Array, fps: float = PHC_FPS) -> Array:
     """Skeleton2Humanoid's SM: mean joint step, mm per frame at 30 Hz; `(..., T - 1)`.
 
     Compare it with the reference's value: a frozen character scores zero, so lower is not better.
     Other rates are rescaled by `fps / 30`.
     """
-    return torch.diff(pos, dim=-3).norm(dim=-1).mean(-1) * (MM * fps / PHC_FPS)
+    return cast("Any", norm(steps(pos)).mean(-1) * (MM * fps / PHC_FPS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,19 +290,19 @@ class HelpAudit:
     torque_p95_nm: float
     work_j_per_s: float
     share_of_body_weight: float
-    force_n: Tensor
-    torque_nm: Tensor
-    power_w: Tensor
+    force_n: Any
+    torque_nm: Any
+    power_w: Any
 
 
 def help_audit(
-    force: Tensor,
-    torque: Tensor,
-    point_vel: Tensor,
-    ang_vel: Tensor,
+    force: Array,
+    torque: Array,
+    point_vel: Array,
+    ang_vel: Array,
     mass: float,
     *,
-    mask: Tensor | None = None,
+    mask: Array | None = None,
 ) -> HelpAudit:
     """Audit the residual wrench of one body `(T, 3)` or of M bodies `(..., T, M, 3)`.
 
@@ -321,13 +325,12 @@ def help_audit(
     if not mass > 0:
         raise PoiseError(f"the character's mass must be above 0 kg, got {mass}", code="out-of-range")
     if force.ndim == 2:
-        force, torque, point_vel, ang_vel = (p.unsqueeze(-2) for p in parts)
-    force_n = force.norm(dim=-1).sum(-1)
-    torque_nm = torque.norm(dim=-1).sum(-1)
+        force, torque, point_vel, ang_vel = (p[..., None, :] for p in parts)
+    force_n = norm(force).sum(-1)
+    torque_nm = norm(torque).sum(-1)
     # P_m = F_m . v_m + tau_m . omega_m; the sign is dropped: braking is help as much as driving.
-    power_w = ((force * point_vel).sum(-1) + (torque * ang_vel).sum(-1)).abs().sum(-1)
-    if mask is None:
-        mask = torch.ones_like(force_n, dtype=torch.bool)
+    power_w = abs((force * point_vel).sum(-1) + (torque * ang_vel).sum(-1)).sum(-1)
+    mask = _full(mask, force_n)
     force_mean = float(masked_mean(force_n, mask))
     return HelpAudit(
         force_mean_n=force_mean,

@@ -10,21 +10,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple
-
-import torch
-from torch import Tensor
+from typing import Any, Literal, NamedTuple, cast
 
 from poise.errors import PoiseError, did_you_mean
-from poise.metrics.shape_points import Shapes, geom_heights
+from poise.metrics.shape_points import Shapes, lowest_points
 from poise.motion.rotations import best_rotation
+from poise.motion.vectors import Array, floored, like, namespace, norm, sliding
 
 MM = 1000.0
 PHC_FPS = 30.0
 """PHC's velocity and acceleration errors are differences between frames at this rate."""
 
 
-def _check_pair(pos: Tensor, ref: Tensor) -> None:
+def _check_pair(pos: Array, ref: Array) -> None:
     if pos.shape != ref.shape or pos.ndim < 3 or pos.shape[-1] != 3:
         raise PoiseError(
             "positions and reference must both be (..., T, B, 3), "
@@ -33,26 +31,33 @@ def _check_pair(pos: Tensor, ref: Tensor) -> None:
         )
 
 
+def steps(x: Array, order: int = 1) -> Array:
+    """Differences of order `order` between frames: `(..., T, B, 3)` gives `(..., T - order, B, 3)`."""
+    for _ in range(order):
+        x = x[..., 1:, :, :] - x[..., :-1, :, :]
+    return x
+
+
 def _check_fps(fps: float) -> None:
     if not 0 < fps < float("inf"):
         raise PoiseError(f"the frame rate must be above 0, got {fps}", code="rate-out-of-range")
 
 
-def mpjpe_global(pos: Tensor, ref: Tensor) -> Tensor:
+def mpjpe_global(pos: Array, ref: Array) -> Array:
     """Mean per-joint position error in the world, mm: `mean_j ||p_j - p_ref,j||`; returns `(..., T)`."""
     _check_pair(pos, ref)
-    return (pos - ref).norm(dim=-1).mean(-1) * MM
+    return cast("Any", norm(pos - ref).mean(-1) * MM)
 
 
-def has_lost(pos: Tensor, ref: Tensor) -> Tensor:
+def has_lost(pos: Array, ref: Array) -> Array:
     """Whether characters have lost their motion: the mean distance of the bodies `(..., B, 3)` m exceeds
     `LOST`, or is no number; `(...)` bool. The one criterion by which that is judged, while characters
     act as afterwards."""
     # Written as "not within" so that NaN counts as lost.
-    return ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
+    return cast("Any", ~(norm(pos - ref).mean(-1) <= LOST))
 
 
-def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
+def mpjpe_root(pos: Array, ref: Array, root: int = 0) -> Array:
     """MPJPE after each side's own root position is subtracted, mm; returns `(..., T)`.
 
     The root itself counts with error zero, as in PHC. Heading is not aligned.
@@ -60,10 +65,10 @@ def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
     _check_pair(pos, ref)
     local = pos - pos[..., root : root + 1, :]
     local_ref = ref - ref[..., root : root + 1, :]
-    return (local - local_ref).norm(dim=-1).mean(-1) * MM
+    return cast("Any", norm(local - local_ref).mean(-1) * MM)
 
 
-def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
+def mpjpe_pa(pos: Array, ref: Array) -> Array:
     """MPJPE after the best similarity (rotation, translation, scale) per frame, mm; returns `(..., T)`.
 
     Procrustes: with centred X, Y the rotation R of `Y^T X` (`rotations.best_rotation`), with the
@@ -71,16 +76,16 @@ def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
     excluded.
     """
     _check_pair(pos, ref)
-    x, y = pos.double(), ref.double()
-    x, y = x - x.mean(-2, keepdim=True), y - y.mean(-2, keepdim=True)
+    xp = namespace(pos)
+    x, y = (xp.astype(p, xp.float64) for p in (pos, ref))
+    x, y = x - x.mean(-2)[..., None, :], y - y.mean(-2)[..., None, :]
     rotation, values = best_rotation(y.mT @ x)
-    size = x.square().sum((-1, -2))
-    scale = values.sum(-1) / size.clamp_min(1e-18)
+    scale = values.sum(-1) / floored((x * x).sum((-1, -2)), 1e-18)
     fitted = scale[..., None, None] * (x @ rotation.mT)
-    return ((fitted - y).norm(dim=-1).mean(-1) * MM).to(pos.dtype)
+    return xp.astype(norm(fitted - y).mean(-1) * MM, pos.dtype)
 
 
-def velocity_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor:
+def velocity_error(pos: Array, ref: Array, fps: float = PHC_FPS) -> Array:
     """Velocity error in PHC's unit, mm per frame at 30 Hz; returns `(..., T - 1)`.
 
     `mean_j ||(p_{t+1} - p_t) - (p_ref,t+1 - p_ref,t)||`. Motions at another rate are rescaled to
@@ -89,10 +94,10 @@ def velocity_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor:
     """
     _check_pair(pos, ref)
     _check_fps(fps)
-    return torch.diff(pos - ref, dim=-3).norm(dim=-1).mean(-1) * (MM * fps / PHC_FPS)
+    return cast("Any", norm(steps(pos - ref)).mean(-1) * (MM * fps / PHC_FPS))
 
 
-def acceleration_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor:
+def acceleration_error(pos: Array, ref: Array, fps: float = PHC_FPS) -> Array:
     """Acceleration error in PHC's unit, mm per frame^2 at 30 Hz; returns `(..., T - 2)`.
 
     `mean_j ||second difference of (p - p_ref)||`, rescaled by `(fps / 30)^2` for other rates
@@ -100,7 +105,7 @@ def acceleration_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor
     """
     _check_pair(pos, ref)
     _check_fps(fps)
-    return torch.diff(pos - ref, n=2, dim=-3).norm(dim=-1).mean(-1) * (MM * (fps / PHC_FPS) ** 2)
+    return cast("Any", norm(steps(pos - ref, 2)).mean(-1) * (MM * (fps / PHC_FPS) ** 2))
 
 
 #: m, the mean distance of the bodies from their reference beyond which a motion is lost.
@@ -162,19 +167,19 @@ class Outcome(NamedTuple):
         first_fail: `(...)` long, the first failing frame, -1 where none fails.
     """
 
-    success: Tensor
-    first_fail: Tensor
+    success: Any
+    first_fail: Any
 
 
 def success(
-    pos: Tensor,
-    ref: Tensor,
-    lengths: Tensor,
+    pos: Array,
+    ref: Array,
+    lengths: Array,
     rule: str | SuccessRule = "phc",
     *,
     bodies: Sequence[int] | None = None,
     root: int = 0,
-    ref_min_height: Tensor | None = None,
+    ref_min_height: Array | None = None,
 ) -> Outcome:
     """Which episodes follow their reference to the end, and where the others first fail.
 
@@ -193,22 +198,23 @@ def success(
         raise PoiseError(
             f"lengths must be {tuple(pos.shape[:-3])}, got {tuple(lengths.shape)}", code="wrong-shape"
         )
-    valid = torch.arange(pos.shape[-3], device=pos.device) < lengths.unsqueeze(-1)
+    xp = namespace(pos)
+    valid = xp.arange(pos.shape[-3], device=pos.device) < lengths[..., None]
     if chosen.measure in ("mean", "max"):
         picked = slice(None) if bodies is None else list(bodies)
-        distance = (pos - ref)[..., picked, :].norm(dim=-1)
-        measured = distance.mean(-1) if chosen.measure == "mean" else distance.amax(-1)
+        distance = norm((pos - ref)[..., picked, :])
+        measured = distance.mean(-1) if chosen.measure == "mean" else xp.max(distance, axis=-1)
     else:
         level = ref[..., root, 2]
         if chosen.measure == "below_min":
             if ref_min_height is None:
-                ref_min_height = torch.where(valid, level, torch.full_like(level, torch.inf)).amin(-1)
-            level = ref_min_height.unsqueeze(-1)
+                ref_min_height = xp.min(xp.where(valid, level, xp.full_like(level, xp.inf)), axis=-1)
+            level = cast("Any", ref_min_height)[..., None]
         measured = level - pos[..., root, 2]
     # Written as "not within" so that NaN counts as a failure.
     bad = ~(measured <= chosen.limit_m) & valid
     failed = bad.any(-1)
-    first = torch.where(failed, bad.long().argmax(-1), torch.full_like(lengths.long(), -1))
+    first = _first(bad)
     return Outcome(~failed & (lengths > 0), first)
 
 
@@ -226,7 +232,7 @@ LASTING_S = 0.5
 """s; shorter spells are a stumble or a hop."""
 
 
-def fallen(pos: Tensor, ref: Tensor, head: int, root: int = 0) -> Tensor:
+def fallen(pos: Array, ref: Array, head: int, root: int = 0) -> Array:
     """Frames `(..., T)` in which the reference is upright and the character is not.
 
     With d the way from the root to the head and z up, the reference is upright where the angle of d and
@@ -242,8 +248,8 @@ def fallen(pos: Tensor, ref: Tensor, head: int, root: int = 0) -> Tensor:
 
 
 def off_feet(
-    pos: Tensor, quat: Tensor, ref: Tensor, ref_quat: Tensor, shapes: Shapes, feet: tuple[int, ...]
-) -> Tensor:
+    pos: Array, quat: Array, ref: Array, ref_quat: Array, shapes: Shapes, feet: tuple[int, ...]
+) -> Array:
     """Frames `(..., T)` in which the reference has a foot within `FOOT_M` of the ground, and the
     character none within `OFF_M`.
 
@@ -252,28 +258,35 @@ def off_feet(
         feet: the bodies that are feet; their shapes tell heights.
     """
     own = shapes.of_bodies(feet)
-    height, stands = (geom_heights(*x, own).amin(-1) for x in ((pos, quat), (ref, ref_quat)))
+    height, stands = (lowest_points(*x, own) for x in ((pos, quat), (ref, ref_quat)))
     return (stands <= FOOT_M) & (height > OFF_M)
 
 
-def first_lasting(bad: Tensor, fps: float) -> Tensor:
+def first_lasting(bad: Array, fps: float) -> Array:
     """`(...)` long, the first frame of a spell of `bad (..., T)` that lasts `LASTING_S`, else -1."""
     frames = max(1, round(LASTING_S * fps))
     if bad.shape[-1] < frames:
-        return torch.full(bad.shape[:-1], -1, dtype=torch.long, device=bad.device)
-    lasting = bad.unfold(-1, frames, 1).all(-1)
-    return torch.where(lasting.any(-1), lasting.long().argmax(-1), -1)
+        xp = namespace(bad)
+        return xp.full(bad.shape[:-1], -1, dtype=xp.int64, device=bad.device)
+    return _first(cast("Any", sliding(bad, frames).all(-1)))
 
 
-def _lean(way: Tensor) -> Tensor:
+def _first(flags: Array) -> Array:
+    """`(...)`, the first that holds of `flags (..., T)`, -1 where none does."""
+    xp = namespace(flags)
+    first = xp.argmax(xp.astype(flags, xp.int64), axis=-1)
+    return xp.where(flags.any(-1), first, -xp.ones_like(first))
+
+
+def _lean(way: Array) -> Array:
     """Angle (rad) of vectors `(..., 3)` and the vertical."""
-    return torch.atan2(way[..., :2].norm(dim=-1), way[..., 2])
+    return namespace(way).atan2(norm(way[..., :2]), way[..., 2])
 
 
-def span_mask(mask: Tensor, order: int) -> Tensor:
+def span_mask(mask: Array, order: int) -> Array:
     """Which of the `T - order` differences of order `order` use valid frames only.
 
-    mask: `(..., T)` bool. Returns `(..., T - order)` bool, aligned with `torch.diff(x, n=order)`.
+    mask: `(..., T)` bool. Returns `(..., T - order)` bool, aligned with differences of that order.
     """
     frames = mask.shape[-1]
     out = mask[..., : max(frames - order, 0)]
@@ -282,30 +295,27 @@ def span_mask(mask: Tensor, order: int) -> Tensor:
     return out
 
 
-def masked_mean(
-    x: Tensor, mask: Tensor | None = None, dim: int | tuple[int, ...] | None = None
-) -> Tensor:
+def masked_mean(x: Array, mask: Array | None = None, dim: int | tuple[int, ...] | None = None) -> Array:
     """Mean of `x` where `mask` (of the same shape) holds; NaN where nothing is valid.
 
     Values under a false mask may be anything, NaN too. `dim=None` reduces everything.
     """
-    dims = tuple(range(x.ndim)) if dim is None else dim
-    if mask is None:
-        mask = torch.ones_like(x, dtype=torch.bool)
-    if mask.shape != x.shape:
+    xp, dims = namespace(x), tuple(range(x.ndim)) if dim is None else dim
+    valid: Any = xp.ones_like(x, dtype=xp.bool) if mask is None else mask
+    if valid.shape != x.shape:
         raise PoiseError(
-            f"the mask has shape {tuple(mask.shape)}, the values {tuple(x.shape)}", code="wrong-shape"
+            f"the mask has shape {tuple(valid.shape)}, the values {tuple(x.shape)}", code="wrong-shape"
         )
-    total = torch.where(mask, x, torch.zeros_like(x)).sum(dims)
-    return total / mask.sum(dims)
+    total, count = xp.where(valid, x, xp.zeros_like(x)).sum(dims), valid.sum(dims)
+    return xp.where(count > 0, total / floored(count, 1), xp.full_like(total, xp.nan))
 
 
-def masked_quantile(x: Tensor, q: float, mask: Tensor | None = None) -> Tensor:
+def masked_quantile(x: Array, q: float, mask: Array | None = None) -> Array:
     """The quantile `q` in [0, 1] of all valid values, linear between neighbours; NaN without any."""
-    values = (x.reshape(-1) if mask is None else x[mask]).sort().values
-    if values.numel() == 0:
-        return x.new_tensor(float("nan"))
-    place = q * (values.numel() - 1)
+    values = namespace(x).sort(x.reshape(-1) if mask is None else x[mask])
+    if not len(values):
+        return like(math.nan, x)
+    place = q * (len(values) - 1)
     low = int(place)
-    high = min(low + 1, values.numel() - 1)
+    high = min(low + 1, len(values) - 1)
     return values[low] + (place - low) * (values[high] - values[low])

@@ -5,15 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.motion.rotations import slerp
-from poise.motion.skeleton import Skeleton, posed
+from poise.motion.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MIN_FPS, MAX_FPS = 0.1, 2000.0
 """Frames per second that motion can have; others are damage, and ask for endless frames."""
@@ -122,13 +126,20 @@ class Clip:
         """Time from the first frame to the last, (T - 1) / fps."""
         return (self.frames - 1) / self.fps
 
-    def tensors(self, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies of `root_pos (T, 3)` and `rot (T, J, 4)` as tensors."""
-        return torch.tensor(self.root_pos, dtype=dtype), torch.tensor(self.rot, dtype=dtype)
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Copies of `root_pos (T, 3)` and `rot (T, J, 4)`, which may be written on."""
+        return self.root_pos.copy(), self.rot.copy()
+
+    def tensors(self, dtype: Any = None) -> tuple[Tensor, Tensor]:
+        """Copies of `root_pos (T, 3)` and `rot (T, J, 4)` as tensors, by default float64."""
+        import torch
+
+        root_pos, rot = torch.tensor(self.root_pos), torch.tensor(self.rot)
+        return root_pos.to(dtype or root_pos.dtype), rot.to(dtype or rot.dtype)
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
-        """World joint positions `(T, J, 3)` m and rotations `(T, J, 4)` wxyz."""
-        return posed(self.skeleton.parents, self.skeleton.offsets, self.root_pos, self.rot)
+        """World joint positions `(T, J, 3)` m and rotations `(T, J, 4)` wxyz, not to be written on."""
+        return _kept_world(self) if self.rot.size <= _KEPT else _world(self)
 
     def positions(self) -> np.ndarray:
         """World joint positions `(T, J, 3)` m."""
@@ -137,6 +148,22 @@ class Clip:
     def replaced(self, **changes: object) -> Clip:
         """A copy with fields replaced."""
         return replace(self, **changes)  # type: ignore[arg-type]
+
+
+#: Numbers of a clip's rotations up to which its world is kept: a minute or two.
+_KEPT = 2**22
+
+
+def _world(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
+    return clip.skeleton.forward(clip.root_pos, clip.rot)
+
+
+@lru_cache(maxsize=4)
+def _kept_world(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
+    """One motion is asked for its world again and again: the last few are kept."""
+    pos, rot = _world(clip)
+    pos.flags.writeable = rot.flags.writeable = False
+    return pos, rot
 
 
 @dataclass(frozen=True)
@@ -257,12 +284,8 @@ def _splined(clip: Clip, at: np.ndarray, straight: Clip) -> Clip:
 def blended(clip: Clip, low: np.ndarray, share: np.ndarray) -> Clip:
     """Frames `(N)`, each the share `(N)` of the way from frame `low (N)` to the next one."""
     root_pos = clip.root_pos[low] * (1 - share[:, None]) + clip.root_pos[low + 1] * share[:, None]
-    rot = slerp(
-        torch.tensor(clip.rot[low]),
-        torch.tensor(clip.rot[low + 1]),
-        torch.tensor(share)[:, None].expand(-1, len(clip.skeleton)),
-    )
-    return clip.replaced(root_pos=root_pos, rot=rot.numpy())
+    rot = slerp(clip.rot[low], clip.rot[low + 1], share[:, None])
+    return clip.replaced(root_pos=root_pos, rot=rot)
 
 
 def trim(clip: Clip, start: int, stop: int | None = None) -> Clip:

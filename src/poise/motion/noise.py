@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
@@ -294,7 +293,7 @@ class Latency(Noise):
         late = seen._replace(pos=self._late(seen.pos, seen.fps))
         if seen.rot is None:
             return late
-        rot = self._late(unwrap_quats(torch.tensor(seen.rot)).numpy(), seen.fps)
+        rot = self._late(unwrap_quats(seen.rot), seen.fps)
         return late._replace(rot=rot / np.linalg.norm(rot, axis=-1, keepdims=True))
 
     def _late(self, values: np.ndarray, fps: float) -> np.ndarray:
@@ -327,7 +326,7 @@ def _unit(axis: Vector) -> np.ndarray:
 
 def _turned(rot: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """Rotations `(..., 4)` turned in their own frames by rotation vectors `(..., 3)` rad."""
-    return quat_mul(torch.tensor(rot), rotvec_to_quat(torch.tensor(turns))).numpy()
+    return quat_mul(rot, rotvec_to_quat(turns))
 
 
 #: Several cameras, triangulated (Pose2Sim, as measured): one axis is twice as bad, nothing is smoothed.

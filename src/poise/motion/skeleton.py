@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.rotations import forward_kinematics
+from poise.motion.vectors import Array, like
 
 #: Bones that differ by less (m) are the same; files round their numbers.
 SAME_M = 1e-4
@@ -172,10 +172,9 @@ class Skeleton:
         """Indices of the joints above `joint`, its parent first."""
         return line_to_root(self.parents, joint)[1:]
 
-    def forward(self, root_pos: torch.Tensor, rot: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, root_pos: Array, rot: Array) -> tuple[Array, Array]:
         """World positions `(..., J, 3)` m and rotations `(..., J, 4)`, see `forward_kinematics`."""
-        offsets = torch.tensor(self.offsets, dtype=rot.dtype)
-        return forward_kinematics(self.parents, offsets, root_pos, rot)
+        return forward_kinematics(self.parents, like(self.offsets, rot), root_pos, rot)
 
     def rest_positions(self) -> np.ndarray:
         """`(J, 3)` m, joint positions with every rotation at identity and the root at the origin."""
@@ -201,14 +200,6 @@ def rest_positions(parents: Sequence[int], offsets: np.ndarray) -> np.ndarray:
         if parent >= 0:
             out[j] = out[parent] + offsets[j]
     return out
-
-
-def posed(
-    parents: Sequence[int], offsets: np.ndarray, root_pos: np.ndarray, rot: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """World positions `(T, J, 3)` and rotations `(T, J, 4)` of arrays, see `forward_kinematics`."""
-    pos, quat = forward_kinematics(parents, *(torch.tensor(x) for x in (offsets, root_pos, rot)))
-    return pos.numpy(), quat.numpy()
 
 
 def triple(v: Iterable[float]) -> tuple[float, float, float]:

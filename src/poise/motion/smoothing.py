@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
-import torch
 from numpy.lib.stride_tricks import sliding_window_view
-from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.motion.vectors import Array
 
 #: Edges of the bands, as shares of half the frame rate, in which a floor is looked for; a band belongs
 #: to it while all groups together have less than `FLAT` times the power of the highest three.
@@ -368,10 +366,7 @@ def smoothed(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -
     return out
 
 
-Values = TypeVar("Values", np.ndarray, Tensor)
-
-
-def smoothstep(u: Values) -> Values:
+def smoothstep(u: Array) -> Array:
     """From 0 to 1 as `u` does, level at both ends."""
     return u * u * (3.0 - 2.0 * u)
 
@@ -391,20 +386,21 @@ def gaussian(sigma: float, reach: int | None = None) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-def gaussian_sums(path: Tensor, sigma: float) -> tuple[Tensor, Tensor, int]:
+def gaussian_sums(path: np.ndarray, sigma: float) -> tuple[np.ndarray, float, int]:
     """Weighted sums `(T, n)` of `path (T, n)` over three deviations `sigma`, the ends held; the sum of
     the weights; and the reach in frames."""
     reach = math.ceil(3 * sigma)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=path.dtype) / sigma) ** 2)
-    padded = torch.cat((path[:1].expand(reach, -1), path, path[-1:].expand(reach, -1)))
-    return (padded.unfold(0, 2 * reach + 1, 1) * kernel).sum(-1), kernel.sum(), reach
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    padded = np.pad(path, ((reach, reach), (0, 0)), mode="edge")
+    sums = sliding_window_view(padded, 2 * reach + 1, axis=0) @ kernel
+    return sums, float(kernel.sum()), reach
 
 
-def fade_beside(frames: int, start: int, stop: int, reach: int) -> Tensor:
+def fade_beside(frames: int, start: int, stop: int, reach: int) -> np.ndarray:
     """`(T)` 1 in the frames `start` to `stop`, falling to 0 over `reach` frames beside them."""
-    at = torch.arange(frames, dtype=torch.float64)
-    away = torch.maximum(start - at, at - stop).clamp(0, reach) / reach
-    return 0.5 + 0.5 * torch.cos(math.pi * away)
+    at = np.arange(frames, dtype=float)
+    away = np.clip(np.maximum(start - at, at - stop), 0, reach) / reach
+    return 0.5 + 0.5 * np.cos(math.pi * away)
 
 
 def smooth_lift(depth: np.ndarray, fps: float, seconds: float, cyclic: bool = False) -> np.ndarray:

@@ -140,7 +140,7 @@ class Candidates:
     ):
         self.copies, self.policy, self.value, self.discount = copies, policy, value, discount
         humanoid = copies.goal.humanoid
-        self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
+        self._shapes, self._feet = shapes_of(humanoid.table), humanoid.feet
         self.steps = 0
 
     def tried(
@@ -340,6 +340,8 @@ class Lookahead:
             each of the reference's frames; None for nothing.
 
     Attributes:
+        keep: `(K, 1)`, the share of the last action that each candidate keeps; the first one, which is
+            the policy's own, keeps that of the task's filter.
         seconds: of each decision.
     """
 
@@ -360,9 +362,9 @@ class Lookahead:
         self._candidates = Candidates(copies, policy, value, c.discount)
         shares = torch.tensor(c.smoothing)
         turn = torch.arange(c.candidates)
-        self._keep = shares[turn % len(shares)].unsqueeze(1)
+        self.keep = shares[turn % len(shares)].unsqueeze(1)
         if copies.task.filter:
-            self._keep[0] = copies.task.filter
+            self.keep[0] = copies.task.filter
         much = torch.tensor(c.corrections)
         self._much = much[turn // len(shares) % len(much)].unsqueeze(1)
         # Held, then fading to nothing at the horizon.
@@ -472,7 +474,7 @@ class Lookahead:
         c, drawn = self.config, self._drawn(last)
         if meanwhile is not None:
             drawn = torch.cat((meanwhile.expand(len(drawn), -1, -1), drawn), 1)
-        changes = Changes(drawn, self._keep, self._much)
+        changes = Changes(drawn, self.keep, self._much)
         cost, _, _, rough, source, apart = self._candidates.tried(snapshot, changes, past.unsqueeze(0))
         if prices is not None:
             cost = cost + (prices[: apart.shape[1]] * apart).sum((1, 2))
@@ -482,7 +484,7 @@ class Lookahead:
         allowed = cost.isfinite() & (cost <= cost.min() + c.slack * max(LEAST, left))
         # Where all went bad the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
-        return Choice(drawn[best], float(self._keep[best]), float(self._much[best]))
+        return Choice(drawn[best], float(self.keep[best]), float(self._much[best]))
 
     def _drawn(self, rest: Tensor | None) -> Tensor:
         """`(K, H, A)` offsets: none, those `(h, A)` planned before, and random ones about either."""

@@ -5,8 +5,9 @@ The settings are imported without torch, which the tasks themselves need.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from poise.lazy import lazy
 
 if TYPE_CHECKING:
     from poise.recipes.residual_force import RECIPE, build
@@ -14,8 +15,4 @@ if TYPE_CHECKING:
 
 __all__ = ["RECIPE", "ResidualForce", "build"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'poise.recipes' has no attribute '{name}'")
-    return getattr(import_module("poise.recipes.residual_force"), name)
+__getattr__ = lazy(__name__, {"residual_force": "RECIPE ResidualForce build"})

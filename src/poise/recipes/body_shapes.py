@@ -30,7 +30,7 @@ from poise.env import observations as obs
 from poise.errors import PoiseError
 from poise.kinematics import clean_clip, place_on_body
 from poise.kinematics.fit import widen
-from poise.kinematics.retarget.own_body import own_table
+from poise.kinematics.retargeting.own_body import own_table
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.settings import Range, validate
 

@@ -290,7 +290,7 @@ def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[Rew
 
 def _soles(humanoid: Humanoid) -> dict[str, Tensor]:
     """Points of the feet for `rewards.foot_slide`."""
-    count, shapes = len(humanoid.bodies), shapes_of(humanoid.table, torch.float32)
+    count, shapes = len(humanoid.bodies), shapes_of(humanoid.table)
     still = torch.zeros(count, 3), torch.eye(4)[:1].expand(count, 4)
     points = [foot_points(*still, shapes, [foot]) for foot in humanoid.feet]
     rows = [torch.full((len(p),), foot) for foot, p in zip(humanoid.feet, points, strict=True)]

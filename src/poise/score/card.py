@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import write_atomic
 from poise.score.thresholds import THRESHOLDS, Verdict
 from poise.settings import plain
 from poise.version import __version__
@@ -155,6 +154,9 @@ class ScoreCard:
 
 def write_score(card: ScoreCard, path: str | Path) -> Path:
     """Writes `score.json` whole or not at all."""
+    # A card is shown without torch, which only runs of a policy need.
+    from poise.learn.checkpoint import write_atomic
+
     path = Path(path)
     write_atomic(path, (json.dumps(card.to_dict(), indent=2, allow_nan=False) + "\n").encode())
     return path

@@ -351,7 +351,7 @@ class Recorder:
             mass=humanoid.mass,
             feet=humanoid.feet,
             head=humanoid.head,
-            shapes=shapes_of(humanoid.table, torch.float32),
+            shapes=shapes_of(humanoid.table),
             limit_n=limit,
             limit_nm=limit,
             ref_min_height=ref.min_height[self.clip],

@@ -15,7 +15,7 @@ from poise.errors import PoiseError
 from poise.learn.transition import FilledGap, Known, TransitionNet
 from poise.metrics import l2p, l2q, npss, physics
 from poise.motion.rotations import forward_kinematics
-from poise.motion.windows import (
+from poise.synthesis.windows import (
     FrameBank,
     centred,
     cut,
@@ -172,7 +172,7 @@ def slide(test: TestSet, pos: Tensor, length: int) -> float:
     """How far feet of transitions `pos (N, length, J, 3)` m slide per frame, mm.
 
     Mean over foot joints and steps, those into and out of the transition too, in which the recorded
-    joint stands by Harvey et al.'s rule (`motion.windows.step_contacts`); 0 where none stands.
+    joint stands by Harvey et al.'s rule (`synthesis.windows.step_contacts`); 0 where none stands.
     """
     feet, past = list(test.feet), test.protocol.past
     truth = test.pos[:, past - 1 : past + length + 1, feet]

@@ -260,7 +260,7 @@ def clip_figures(
         joints: the clip's joint that each body of `shapes` is fixed to. feet: the bodies that are feet.
         ground: height (m) of the floor under the soles, for the slide; penetration is below z = 0.
     """
-    pos, quat = (torch.tensor(x)[:, list(joints)] for x in clip.world())
+    pos, quat = (x[:, list(joints)] for x in clip.world())
     slide = foot_slide(foot_points(pos, quat, shapes, feet), clip.fps, ground=ground)
     return {
         "point_slide_mm_per_s": float(slide),

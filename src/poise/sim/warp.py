@@ -70,7 +70,8 @@ class WarpModel:
         new = self._wp.empty((self._num_envs, *old.shape[1:]), dtype=old.dtype, device=old.device)
         view = self._wp.to_torch(new)
         view.copy_(self._wp.to_torch(old).expand_as(view))
-        new._is_batched = True  # mujoco_warp's own mark for arrays with the world as first axis.
+        # mujoco_warp's own mark for arrays with the world as first axis; it has no public one.
+        new._is_batched = True  # noqa: SLF001
         setattr(*self._place(field), new)
         self.expanded[field] = view
         return view

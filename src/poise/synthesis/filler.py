@@ -15,8 +15,8 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.kinematics.feet import Motion
-from poise.kinematics.retarget.passage import Retargeter
-from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.retargeting.passage import Retargeter
+from poise.kinematics.retargeting.standing import ClipWorld
 from poise.kinematics.steps import lock_feet, planted, stepped
 from poise.learn.between import Between
 from poise.learn.inbetween_model import Adaptation, InbetweenModel, adapt
@@ -261,21 +261,20 @@ class Filling:
     rounds: int = 4
 
 
-def interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
+def interpolated(own: Clip, root: np.ndarray, rot: np.ndarray, gaps: list[Gap]) -> Clip:
     """The clip with its gaps interpolated: what lies in them is not to be looked at."""
-    root, rot = root.clone(), rot.clone()
+    root, rot = root.copy(), rot.copy()
     for gap in gaps:
         root[gap.a + 1 : gap.b], rot[gap.a + 1 : gap.b] = straight(root, rot, gap)
-    return own.replaced(root_pos=root.numpy(), rot=rot.numpy(), contacts=())
+    return own.replaced(root_pos=root, rot=rot, contacts=())
 
 
-def straight(root: Tensor, rot: Tensor, gap: Gap) -> tuple[Tensor, Tensor]:
+def straight(root: np.ndarray, rot: np.ndarray, gap: Gap) -> tuple[np.ndarray, np.ndarray]:
     """The frames of a gap on straight lines and shortest arcs between its ends."""
     a, b = gap
-    t = torch.arange(1, b - a, dtype=root.dtype) / (b - a)
+    t = np.arange(1, b - a, dtype=root.dtype) / (b - a)
     line = root[a] + t[:, None] * (root[b] - root[a])
-    shape = (len(t), *rot.shape[1:])
-    return line, slerp(rot[a].expand(shape), rot[b].expand(shape), t[:, None].expand(shape[:2]))
+    return line, slerp(rot[a], rot[b], t[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,20 +297,20 @@ class Filler:
     keys: tuple[int, ...]
     rig: OtherRig | None
     feet: Sequence[int]
-    limits: Tensor
+    limits: np.ndarray
     aloft: dict[int, float]
-    speeds: dict[int, Tensor] = field(default_factory=dict[int, Tensor])
+    speeds: dict[int, np.ndarray] = field(default_factory=dict[int, np.ndarray])
     floor: tuple[float, float] = (0.0, 0.0)
     calmed: dict[Gap, Calmed] = field(default_factory=dict[Gap, Calmed])
-    best: dict[Gap, tuple[Tensor, Tensor, Tensor]] = field(
-        default_factory=dict[Gap, tuple[Tensor, Tensor, Tensor]]
+    best: dict[Gap, tuple[np.ndarray, np.ndarray, np.ndarray]] = field(
+        default_factory=dict[Gap, tuple[np.ndarray, np.ndarray, np.ndarray]]
     )
 
     @torch.no_grad()
     def fill(
         self,
-        root: Tensor,
-        rot: Tensor,
+        root: np.ndarray,
+        rot: np.ndarray,
         gap: Gap,
         noise: torch.Generator | None,
         most: float = 1.0,
@@ -334,14 +333,14 @@ class Filler:
         if max(before, after) > 0.0:
             speeds = self.speeds.get(a), self.speeds.get(b)
             flight = flown(plain[0][:, 2], ends[0][:, :2], before, after, self.own.fps, speeds)
-            path = torch.cat((flight.level, flight.height[:, None]), 1)
-            made, plain = (path, made[1]), (path.clone(), plain[1])
+            path = np.concatenate((flight.level, flight.height[:, None]), 1)
+            made, plain = (path, made[1]), (path.copy(), plain[1])
 
         def fast(whole: Motion) -> float:
             return excess(self.own.skeleton, self.limits, whole, self.own.fps)[0]
 
         def over(motion: Motion) -> float:
-            whole = tuple(torch.cat((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
+            whole = tuple(np.concatenate((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
             return fast((whole[0], whole[1]))
 
         def finish(motion: Motion, feet: Feet) -> Motion:
@@ -362,7 +361,7 @@ class Filler:
                 if walked is not None:
                     root[here], rot[here] = walked
                     self._finish(root, rot, gap, contact[:, :0])
-            return root[a + 1 : b].clone(), rot[a + 1 : b].clone()
+            return root[a + 1 : b].copy(), rot[a + 1 : b].copy()
 
         if flight is not None:
             # Feet that are let go would be under the floor before and after a flight.
@@ -371,20 +370,20 @@ class Filler:
         root[a + 1 : b], rot[a + 1 : b] = done.motion
         self.calmed[gap] = done
 
-    def join(self, root: Tensor, rot: Tensor, gap: Gap) -> None:
+    def join(self, root: np.ndarray, rot: np.ndarray, gap: Gap) -> None:
         """Lets the ends of a filled gap meet what lies beside it now, in place."""
-        self._finish(root, rot, gap, torch.zeros(gap.b - gap.a - 1, 0))
+        self._finish(root, rot, gap, np.zeros((gap.b - gap.a - 1, 0)))
 
-    def _finish(self, root: Tensor, rot: Tensor, gap: Gap, contact: Tensor) -> None:
+    def _finish(self, root: np.ndarray, rot: np.ndarray, gap: Gap, contact: np.ndarray) -> None:
         """Holds the feet of a gap and lets its ends meet, in place."""
         a, b = gap
         # Two frames before, and after the gap where they are kept, say how fast it must be met.
         low = max(0, a - 1)
         high = min(len(root), b + 2) if b >= self.keys[-1] else b + 1
         if len(self.feet) and len(self.feet) == contact.shape[1]:
-            free = torch.zeros(high - low, dtype=torch.bool)
+            free = np.zeros(high - low, dtype=bool)
             free[a + 1 - low : b - low] = True
-            stands = torch.zeros(high - low, contact.shape[1], dtype=torch.bool)
+            stands = np.zeros((high - low, contact.shape[1]), dtype=bool)
             stands[a + 1 - low : b - low] = contact > 0.5
             # A keyframe next to a standing foot is where that foot stands.
             stands[a - low], stands[b - low] = stands[a + 1 - low], stands[b - 1 - low]
@@ -396,43 +395,49 @@ class Filler:
         root[a + 1 : b], rot[a + 1 : b] = (x[a + 1 - low : b - low] for x in met)
 
     def _transition(
-        self, root: Tensor, rot: Tensor, gap: Gap, noise: torch.Generator | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        self, root: np.ndarray, rot: np.ndarray, gap: Gap, noise: torch.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the network makes of one gap, at the clip's own frames."""
         (a, b), own, model, rig = gap, self.own, self.model, self.rig
         # The gap is cut into whole steps near the model's rate, so that both its ends lie on the grid.
         length = max(1, round((b - a) * model.fps / own.fps) - 1)
         step = (b - a) / (length + 1)
         past = min(model.past, 1 + int(a / step + 1e-6))
-        before = sampled(root[: a + 1], rot[: a + 1], a - step * torch.arange(past - 1, -1, -1).double())
+        before = sampled(root[: a + 1], rot[: a + 1], a - step * np.arange(past - 1, -1, -1))
         ahead, after = (root[b : b + 1], rot[b : b + 1]), self._after(root, rot, b, step)
-        offsets = torch.tensor(np.array((own if rig is None else rig.example).skeleton.offsets))
+        offsets = np.array((own if rig is None else rig.example).skeleton.offsets)
         if rig is not None:
             before, ahead = rig.to_model(before), rig.to_model(ahead)
             after = None if after is None else rig.to_model(after)
-        seen = (x.unsqueeze(0).float() for x in (*before, ahead[0][0], ahead[1][0], offsets))
+        seen = (_seen(x) for x in (*before, ahead[0][0], ahead[1][0], offsets))
         known, net = Known(*seen), model.net
         if self.filling.adaptation is not None:
             net = adapt(net, known, length, self.filling.adaptation)
         if isinstance(net, Between):
-            filled = _by_transformer(net, known, length, after, noise, model.fps)
+            later = None if after is None else (_seen(after[0]), _seen(after[1]))
+            filled = _by_transformer(net, known, length, later, noise, model.fps)
         else:
             filled = net.fill(known, length, noise)
-        grid_root = torch.cat((before[0], filled.root[0].double(), ahead[0]))
-        grid_rot = torch.cat((before[1], filled.rot[0].double(), ahead[1]))
-        at = torch.arange(a + 1, b).double()
+        made = (x[0].double().numpy() for x in (filled.root, filled.rot))
+        grid_root, grid_rot = map(np.concatenate, zip(before, made, ahead, strict=True))
+        at = np.arange(a + 1, b).astype(float)
         new_root, new_rot = sampled(grid_root, grid_rot, past - 1 + (at - a) / step)
         if rig is not None:
             new_root, new_rot = rig.changed(straight(root, rot, gap), (new_root, new_rot))
-        nearest = ((at - a) / step).round().long().clamp(1, length) - 1
-        return new_root, new_rot, filled.contact[0][nearest]
+        nearest = np.clip(np.round((at - a) / step).astype(int), 1, length) - 1
+        return new_root, new_rot, filled.contact[0].numpy()[nearest]
 
-    def _after(self, root: Tensor, rot: Tensor, b: int, step: float) -> tuple[Tensor, Tensor] | None:
+    def _after(self, root: np.ndarray, rot: np.ndarray, b: int, step: float) -> Motion | None:
         """Frames after the last keyframe at the model's rate, where the clip has any that are kept."""
         count = min(self.model.past - 1, int((len(root) - 1 - b) / step + 1e-6))
         if b < self.keys[-1] or count < 1:
             return None
-        return sampled(root[b:], rot[b:], step * torch.arange(1, count + 1).double())
+        return sampled(root[b:], rot[b:], step * np.arange(1, count + 1))
+
+
+def _seen(x: np.ndarray) -> Tensor:
+    """What a network is shown, as a batch of one."""
+    return torch.tensor(x, dtype=torch.float32)[None]
 
 
 def _by_transformer(
@@ -448,7 +453,7 @@ def _by_transformer(
         (known.target_root[:, None], target),
     ]
     if after is not None:
-        parts.append((after[0].unsqueeze(0).float(), after[1].unsqueeze(0).float()))
+        parts.append(after)
     root, rot = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     seen = torch.ones(root.shape[1], dtype=torch.bool)
     seen[past : past + length] = False

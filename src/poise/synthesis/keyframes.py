@@ -8,8 +8,6 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
 from poise.formats.own import unpack_clips
@@ -18,7 +16,6 @@ from poise.kinematics.feet import off_floor, standing_heights, under_floor
 from poise.learn.inbetween_model import InbetweenModel
 from poise.motion import Clip
 from poise.motion.rotations import slerp
-from poise.motion.windows import foot_joints, still_root, without_still_root
 from poise.synthesis.filler import (
     Filler,
     Filling,
@@ -31,6 +28,7 @@ from poise.synthesis.filler import (
 from poise.synthesis.limits import ALOFT_M, Calmed, fastest, flight_speeds, sampled
 from poise.synthesis.rounds import GapFault, best_of_rounds
 from poise.synthesis.rounds import told as named
+from poise.synthesis.windows import foot_joints, still_root, without_still_root
 
 #: Bones with directions that differ by more than this (mean over joints, cosine) are of another rig.
 _SAME_RIG = 0.94
@@ -82,12 +80,12 @@ def fill_keyframes(
     if not gaps:
         warnings.append("There is nothing to fill between these keyframes: the clip stays as it is")
     own = without_still_root(clip)
-    root, rot = own.tensors()
+    root, rot = own.arrays()
     for k in inserted:
         a, b = max(x for x in keys if x < k), min(x for x in keys if x > k)
-        t = torch.tensor((k - a) / (b - a), dtype=root.dtype)
+        t = (k - a) / (b - a)
         root[k] = root[a] + t * (root[b] - root[a])
-        rot[k] = slerp(rot[a], rot[b], t.expand(rot.shape[1]))
+        rot[k] = slerp(rot[a], rot[b], t)
     rig, feet = None, model.layout.feet
     if other is not None:
         rig = OtherRig.between(interpolated(own, root, rot, gaps), _example(other, clip, model))
@@ -178,12 +176,12 @@ def _example(other: str, clip: Clip, model: InbetweenModel) -> Clip:
     raise PoiseError(other, clip.name, hint, code="skeleton-differs")
 
 
-def _as_clip(clip: Clip, root: Tensor, rot: Tensor, name: str) -> Clip:
+def _as_clip(clip: Clip, root: np.ndarray, rot: np.ndarray, name: str) -> Clip:
     """The result on the clip's own skeleton, a still root included."""
-    turned = rot.numpy()
+    turned = rot
     if still_root(clip):
         turned = np.concatenate((np.array(clip.rot[:, :1]), turned), 1)
-    return clip.replaced(root_pos=root.numpy(), rot=turned, name=name, cyclic=False, contacts=())
+    return clip.replaced(root_pos=root, rot=turned, name=name, cyclic=False, contacts=())
 
 
 @dataclass(frozen=True)
@@ -231,11 +229,9 @@ def retimed(
     for (a, b), (x, y) in zip(pairwise(keys), pairwise(at), strict=True):
         places.append(a + (b - a) * np.arange(y - x) / (y - x))
     places.append(np.arange(keys[-1], clip.frames, dtype=float))
-    root, rot = clip.tensors()
-    new = sampled(root, rot, torch.tensor(np.concatenate(places)))
-    return clip.replaced(root_pos=new[0].numpy(), rot=new[1].numpy(), cyclic=False, contacts=()), tuple(
-        at
-    )
+    root, rot = clip.arrays()
+    new = sampled(root, rot, np.concatenate(places))
+    return clip.replaced(root_pos=new[0], rot=new[1], cyclic=False, contacts=()), tuple(at)
 
 
 #: What words mean.

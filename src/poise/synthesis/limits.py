@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError
@@ -24,6 +23,7 @@ from poise.motion.rotations import (
     unwrap_quats,
 )
 from poise.motion.smoothing import smoothstep
+from poise.motion.vectors import lerp, norm
 
 #: m/s, the fastest of a thousand frames of each part in CMU's motions and DeepMimic's (30 Hz, 62 clips).
 FASTEST = {
@@ -48,22 +48,22 @@ ALOFT_M = 0.12
 Feet = Literal["held", "stepped", "free"]
 
 
-def fastest(skeleton: Skeleton) -> Tensor:
+def fastest(skeleton: Skeleton) -> np.ndarray:
     """`(J,)` m/s that each joint reaches at most; infinite where a joint is no known part of a body."""
-    out = torch.full((len(skeleton),), torch.inf, dtype=torch.float64)
+    out = np.full((len(skeleton),), np.inf)
     try:
         parts = find_anatomy(skeleton).parts
     except PoiseError:
         return out
     for part in parts:
-        out[part.joint] = FASTEST.get(part.kind, torch.inf)
+        out[part.joint] = FASTEST.get(part.kind, np.inf)
     return out
 
 
-def excess(skeleton: Skeleton, limits: Tensor, motion: Motion, fps: float) -> tuple[float, int]:
+def excess(skeleton: Skeleton, limits: np.ndarray, motion: Motion, fps: float) -> tuple[float, int]:
     """By how much the fastest joint goes beyond its limit, as a factor, and which one it is."""
     pos = skeleton.forward(*motion)[0]
-    over = (pos.diff(dim=0).norm(dim=-1) * fps).amax(0) / limits
+    over = (norm(np.diff(pos, axis=0)) * fps).max(0) / limits
     joint = int(over.argmax())
     return float(over[joint]), joint
 
@@ -106,8 +106,8 @@ def calmed(
     best: Calmed | None = None
     for way in ways:
         for share in (x for x in SHARES if x <= most):
-            part = torch.tensor(share, dtype=made[1].dtype).expand(made[1].shape[:2])
-            mixed = torch.lerp(plain[0], made[0], share), slerp(plain[1], made[1], part)
+            part = np.full(made[1].shape[:2], share)
+            mixed = lerp(plain[0], made[0], part[:, :1]), slerp(plain[1], made[1], part)
             done = finish(mixed, way)
             tried = Calmed(done, share, way, over(done))
             if tried.over <= 1.0:
@@ -139,11 +139,11 @@ class Flown(NamedTuple):
         lean: `(n,)` rad that the trunk leans ahead.
     """
 
-    height: Tensor
-    in_air: Tensor
-    level: Tensor
+    height: np.ndarray
+    in_air: np.ndarray
+    level: np.ndarray
     falls: tuple[float, float]
-    lean: Tensor
+    lean: np.ndarray
 
 
 def fall_s(height: float) -> float:
@@ -164,8 +164,8 @@ def start_s(height: float) -> float:
 
 
 def flight_speeds(
-    places: Tensor, keys: Sequence[int], aloft: Mapping[int, float], fps: float
-) -> dict[int, Tensor]:
+    places: np.ndarray, keys: Sequence[int], aloft: Mapping[int, float], fps: float
+) -> dict[int, np.ndarray]:
     """The level velocity `(2,)` m/s at each keyframe in the air, the same before it and after it.
 
     With the ways D to the keyframes on either side, f s of each in the air and p s on the floor beside
@@ -176,7 +176,7 @@ def flight_speeds(
         places: `(T, 2)` m, the root in all frames.
         keys: all keyframes. aloft: m that each is in the air.
     """
-    out: dict[int, Tensor] = {}
+    out: dict[int, np.ndarray] = {}
     for k in (k for k in keys if aloft.get(k, 0.0) > 0.0):
         if k == keys[-1] and k + 1 < len(places):
             out[k] = (places[k + 1] - places[k]) * fps
@@ -188,10 +188,10 @@ def flight_speeds(
 
 
 def _speed(
-    places: Tensor, keys: Sequence[int], aloft: Mapping[int, float], k: int, fps: float
-) -> Tensor:
+    places: np.ndarray, keys: Sequence[int], aloft: Mapping[int, float], k: int, fps: float
+) -> np.ndarray:
     number = list(keys).index(k)
-    above, below = torch.zeros(2, dtype=places.dtype), 0.0
+    above, below = np.zeros(2, dtype=places.dtype), 0.0
     fall, push = fall_s(aloft[k]), start_s(aloft[k])
     for other in (number - 1, number + 1):
         if not 0 <= other < len(keys):
@@ -209,12 +209,12 @@ def _speed(
 
 
 def flown(
-    height: Tensor,
-    ends: Tensor,
+    height: np.ndarray,
+    ends: np.ndarray,
     before: float,
     after: float,
     fps: float,
-    speeds: tuple[Tensor | None, Tensor | None] = (None, None),
+    speeds: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> Flown:
     """A root in a gap of n frames with an end in the air: there it rises or falls by gravity.
 
@@ -231,21 +231,21 @@ def flown(
         speeds: `(2,)` m/s in the air beside each; from its way alone by default.
     """
     n = len(height)
-    t = torch.arange(1, n + 1, dtype=height.dtype) / fps
+    t = np.arange(1, n + 1, dtype=height.dtype) / fps
     whole = (n + 1) / fps
     falls = fall_s(before), fall_s(after)
     if whole < sum(falls) and before > 0.0 and after > 0.0:
         rise = 0.5 * GRAVITY * t * (whole - t)
-        level = torch.lerp(ends[0], ends[1], (t / whole)[:, None])
-        all_ = torch.ones(n, dtype=torch.bool)
-        return Flown(height + rise, all_, level, (whole, whole), torch.zeros_like(height))
-    out, in_air, lean = height.clone(), torch.zeros(n, dtype=torch.bool), torch.zeros_like(height)
+        level = lerp(ends[0], ends[1], (t / whole)[:, None])
+        all_ = np.ones(n, dtype=bool)
+        return Flown(height + rise, all_, level, (whole, whole), np.zeros_like(height))
+    out, in_air, lean = height.copy(), np.zeros(n, dtype=bool), np.zeros_like(height)
     sides = (before, falls[0], t, LEANS[1]), (after, falls[1], whole - t, LEANS[0])
     for off, fall, since, most in sides:
         if off <= 0.0:
             continue
         # The line's own rise goes, and what is left where the gap ends before the flight does.
-        flight = (off - 0.5 * GRAVITY * since**2).clamp_min(0.0)
+        flight = np.maximum(off - 0.5 * GRAVITY * since**2, 0.0)
         rest = max(0.0, off - 0.5 * GRAVITY * whole**2)
         out = out + flight - (rest * since + off * (whole - since)) / whole
         depth, push = crouch_of(off)
@@ -258,78 +258,80 @@ def flown(
 
 
 def _ahead(
-    t: Tensor,
+    t: np.ndarray,
     whole: float,
-    ends: Tensor,
+    ends: np.ndarray,
     off: tuple[float, float],
     falls: tuple[float, float],
-    speeds: tuple[Tensor | None, Tensor | None],
-) -> Tensor:
+    speeds: tuple[np.ndarray | None, np.ndarray | None],
+) -> np.ndarray:
     """`(n, 2)` m, the level way of a root at times `t` of a gap of `whole` s."""
     flies = off[0] > 0.0, off[1] > 0.0
     if not any(flies):
-        return torch.lerp(ends[0], ends[1], (t / whole)[:, None])
+        return lerp(ends[0], ends[1], (t / whole)[:, None])
     way, push = ends[1] - ends[0], [start_s(h) for h in off]
     alone = way / max(sum(f + 0.5 * p for f, p, up in zip(falls, push, flies, strict=True) if up), 1e-6)
     v = [alone if one is None else one for one in speeds]
-    v = [x if up else torch.zeros_like(way) for x, up in zip(v, flies, strict=True)]
+    v = [x if up else np.zeros_like(way) for x, up in zip(v, flies, strict=True)]
     # On the floor: from where the first flight lands to where the second begins.
     start, stop = ends[0] + falls[0] * v[0], ends[1] - falls[1] * v[1]
     ground = max(whole - sum(falls), 0.0)
     longest = ground
     if not all(flies):
         k = 0 if flies[0] else 1
-        longest = RUN_UP * float((stop - start).norm()) / max(float(v[k].norm()), 1e-6)
+        longest = RUN_UP * float(norm(stop - start)) / max(float(norm(v[k])), 1e-6)
         longest = min(max(longest, crouch_of(off[k])[1]), ground)
     begins = falls[0] if flies[0] else whole - falls[1] - longest
-    u = ((t - begins) / max(longest, 1e-6)).clamp(0.0, 1.0)[:, None]
+    u = np.clip((t - begins) / max(longest, 1e-6), 0.0, 1.0)[:, None]
     out = hermite(u, start, stop, v[0] * longest, v[1] * longest)
-    out = torch.where((t < falls[0])[:, None], ends[0] + t[:, None] * v[0], out)
-    return torch.where((whole - t < falls[1])[:, None], ends[1] - (whole - t)[:, None] * v[1], out)
+    out = np.where((t < falls[0])[:, None], ends[0] + t[:, None] * v[0], out)
+    return np.where((whole - t < falls[1])[:, None], ends[1] - (whole - t)[:, None] * v[1], out)
 
 
-def _crouch(since: Tensor, depth: float, push: float, room_s: float) -> Tensor:
+def _crouch(since: np.ndarray, depth: float, push: float, room_s: float) -> np.ndarray:
     """How deep (m) a body crouches, `since` seconds before it takes off or after it landed.
 
     depth: at most, m. push: s from there to the take-off. room_s: what there is of the gap.
     """
     speed = 2.0 * depth / push
     if room_s < push + CROUCH_S:
-        return torch.zeros_like(since)
+        return np.zeros_like(since)
     pushing = depth - 0.5 * speed / push * (push - since) ** 2
-    sinking = 0.5 * depth * (1.0 + torch.cos(torch.pi * (since - push) / CROUCH_S))
-    down = torch.where(since <= push, pushing, sinking)
-    return torch.where((since > 0.0) & (since < push + CROUCH_S), down, 0.0)
+    sinking = 0.5 * depth * (1.0 + np.cos(np.pi * (since - push) / CROUCH_S))
+    down = np.where(since <= push, pushing, sinking)
+    return np.where((since > 0.0) & (since < push + CROUCH_S), down, 0.0)
 
 
-def sampled(root: Tensor, rot: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+def sampled(root: np.ndarray, rot: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Frames at real-valued places `at (K)` of a path: positions on a cubic, rotations by arcs.
 
     root `(T, 3)`, rot `(T, J, 4)`. The cubic is Catmull and Rom's, which runs through every frame.
     """
     last = len(root) - 1
-    low = at.floor().long().clamp(0, max(0, last - 1))
-    t = (at - low).unsqueeze(-1)
+    low = np.clip(np.floor(at).astype(int), 0, max(0, last - 1))
+    t = (at - low)[..., None]
     if last == 0:
-        return root.expand(len(at), 3), rot.expand(len(at), *rot.shape[1:])
-    p = [root[(low + k).clamp(0, last)] for k in (-1, 0, 1, 2)]
+        return np.broadcast_to(root, (len(at), 3)), np.broadcast_to(rot, (len(at), *rot.shape[1:]))
+    p = [root[np.clip(low + k, 0, last)] for k in (-1, 0, 1, 2)]
     cubic = (
         p[1]
         + 0.5 * t * (p[2] - p[0])
         + t**2 * (p[0] - 2.5 * p[1] + 2 * p[2] - 0.5 * p[3])
         + t**3 * (1.5 * (p[1] - p[2]) + 0.5 * (p[3] - p[0]))
     )
-    return cubic, slerp(rot[low], rot[low + 1], t.expand(-1, rot.shape[1]))
+    return cubic, slerp(rot[low], rot[low + 1], t)
 
 
-def fade(count: int, frames: int) -> Tensor:
+def fade(count: int, frames: int) -> np.ndarray:
     """Weights `(count)` from 1 at the first frame down to 0 after `frames`, and at the last frame."""
     reach = max(1, min(frames, count - 1))
-    t = (torch.arange(count, dtype=torch.float64) / reach).clamp(max=1.0)
-    return 0.5 * (1 + torch.cos(torch.pi * t))
+    t = np.minimum(np.arange(count, dtype=float) / reach, 1.0)
+    return 0.5 * (1 + np.cos(np.pi * t))
 
 
-def spread(ends: tuple[Tensor, Tensor], made: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def spread(
+    ends: tuple[np.ndarray, np.ndarray], made: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Generated frames that lead from one kept frame to another, with what they miss of either spread
     over all of them.
 
@@ -345,10 +347,10 @@ def spread(ends: tuple[Tensor, Tensor], made: tuple[Tensor, Tensor]) -> tuple[Te
     (ends_root, ends_rot), (root, rot) = ends, made
     n = len(root)
     if n < 2:
-        return root.clone(), rot.clone()
-    t = torch.arange(1, n + 1, dtype=root.dtype) / (n + 1)
+        return root.copy(), rot.copy()
+    t = np.arange(1, n + 1, dtype=root.dtype) / (n + 1)
     ease = smoothstep(t)
-    shift, turn = torch.zeros_like(root), torch.zeros(n, rot.shape[1], 3, dtype=rot.dtype)
+    shift, turn = np.zeros_like(root), np.zeros((n, rot.shape[1], 3), dtype=rot.dtype)
     for k, (a, b), weight in ((0, (1, 0), 1 - ease), (1, (n - 2, n - 1), ease)):
         place, pose = _ahead_seams(root, rot, a, b)
         shift += weight[:, None] * (ends_root[k] - place)
@@ -356,7 +358,9 @@ def spread(ends: tuple[Tensor, Tensor], made: tuple[Tensor, Tensor]) -> tuple[Te
     return root + shift, normalize(quat_mul(rotvec_to_quat(turn), rot))
 
 
-def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tuple[Tensor, Tensor]:
+def meet(
+    root: np.ndarray, rot: np.ndarray, before: int, after: int, blend: int
+) -> tuple[np.ndarray, np.ndarray]:
     """A path; its generated middle leaves and reaches the kept frames at their speed.
 
         y(1) = x(0) + (x(0) - x(-1)),   y(n) = x(n+1) - (x(n+2) - x(n+1)),
@@ -370,7 +374,7 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
         root `(T, 3)`, rot `(T, J, 4)`: kept frames, generated frames, kept frames.
         before, after: how many frames are kept at the beginning and at the end.
     """
-    root, rot = root.clone(), unwrap_quats(rot)
+    root, rot = root.copy(), unwrap_quats(rot)
     n = len(root) - before - after
     if n < 1:
         return root, rot
@@ -380,17 +384,17 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
         wishes.append((_ahead_seams(root, rot, before - 2, before - 1), 0, fade(n, blend)))
     if after >= 2:
         end = before + n
-        wishes.append((_ahead_seams(root, rot, end + 1, end), n - 1, fade(n, blend).flip(0)))
+        wishes.append((_ahead_seams(root, rot, end + 1, end), n - 1, np.flip(fade(n, blend), 0)))
     share = 1.0 if n > 1 else 1.0 / max(1, len(wishes))
-    shift, turn = torch.zeros_like(root[gap]), torch.zeros(n, rot.shape[1], 3, dtype=rot.dtype)
+    shift, turn = np.zeros_like(root[gap]), np.zeros((n, rot.shape[1], 3), dtype=rot.dtype)
     for (place, pose), at, weight in wishes:
-        weight = weight.to(root) * share
+        weight = weight * share
         shift += weight[:, None] * (place - root[before + at])
         apart = quat_to_rotvec(quat_mul(pose, quat_conj(rot[before + at])))
         turn += weight[:, None, None] * apart
     if after == 1 and n > 1:
         # y(i) += s(i) (x(n+1) - (2 y(n) - y(n-1))),  s from 0 to 1 along a smooth step
-        t = (torch.arange(n, dtype=root.dtype) - (n - 1 - min(blend, n - 1))).clamp_min(0)
+        t = np.maximum(np.arange(n, dtype=root.dtype) - (n - 1 - min(blend, n - 1)), 0)
         t = t / (min(blend, n - 1) + 1)
         ease = smoothstep(t)
         place, pose = _ahead_seams(root, rot, before + n - 2, before + n - 1)
@@ -401,6 +405,6 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
     return root, unwrap_quats(rot)
 
 
-def _ahead_seams(root: Tensor, rot: Tensor, a: int, b: int) -> tuple[Tensor, Tensor]:
+def _ahead_seams(root: np.ndarray, rot: np.ndarray, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
     """Where the motion from frame `a` to frame `b` leads one frame later."""
     return 2 * root[b] - root[a], quat_mul(quat_mul(rot[b], quat_conj(rot[a])), rot[b])

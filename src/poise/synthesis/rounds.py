@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from poise.kinematics.feet import Motion
 from poise.kinematics.repair.faults import KINDS
@@ -15,6 +15,7 @@ from poise.kinematics.repair.motion_doctor import examine, heal
 from poise.motion import Clip
 from poise.motion.rotations import slerp
 from poise.motion.smoothing import smoothstep
+from poise.motion.vectors import lerp
 from poise.synthesis.filler import Filler, Gap
 from poise.synthesis.limits import Calmed, Feet, excess
 
@@ -122,7 +123,7 @@ def best_of_rounds(
     gaps: Sequence[Gap],
     sample: int,
     on_gap: Callable[[int], None] | None = None,
-) -> tuple[Tensor, Tensor, tuple[GapFault, ...]]:
+) -> tuple[np.ndarray, np.ndarray, tuple[GapFault, ...]]:
     """Root and rotations of one filled clip, and the faults that are left in it.
 
     In further rounds gaps with faults are filled anew: the best guess (sample 0) with less of the
@@ -132,8 +133,8 @@ def best_of_rounds(
     Args:
         on_gap: is told how many gaps are filled, in the first round.
     """
-    root, rot = path[0].clone(), path[1].clone()
-    kept: dict[Gap, tuple[tuple[int, float], Motion, Calmed | None, Tensor]] = {}
+    root, rot = path[0].copy(), path[1].copy()
+    kept: dict[Gap, tuple[tuple[int, float], Motion, Calmed | None, np.ndarray]] = {}
     wanting = list(gaps)
     for round_ in range(max(1, filler.filling.rounds)):
         noise, (most, ways) = None, ROUNDS[min(round_, len(ROUNDS) - 1)]
@@ -141,9 +142,9 @@ def best_of_rounds(
             most = 1.0
             seed = (filler.filling.seed * 100_003 + sample) * 1_009 + round_
             noise = torch.Generator().manual_seed(seed)
-        beside: dict[Gap, Tensor] = {}
+        beside: dict[Gap, np.ndarray] = {}
         for made, gap in enumerate(wanting, 1):
-            beside[gap] = rot[max(0, gap.a - 1)].clone()
+            beside[gap] = rot[max(0, gap.a - 1)].copy()
             filler.fill(root, rot, gap, noise, most, ways)
             if on_gap is not None and not round_:
                 on_gap(made)
@@ -166,14 +167,14 @@ def best_of_rounds(
 
 def _compose(
     filler: Filler,
-    root: Tensor,
-    rot: Tensor,
-    kept: dict[Gap, tuple[tuple[int, float], Motion, Calmed | None, Tensor]],
+    root: np.ndarray,
+    rot: np.ndarray,
+    kept: dict[Gap, tuple[tuple[int, float], Motion, Calmed | None, np.ndarray]],
 ) -> None:
     """The best of each gap, in place, with ends that meet."""
     for gap, (_, motion, calmed, before) in kept.items():
         root[gap.a + 1 : gap.b], rot[gap.a + 1 : gap.b] = motion
-        if not torch.equal(before, rot[max(0, gap.a - 1)]):
+        if not np.array_equal(before, rot[max(0, gap.a - 1)]):
             # The gap before it ends in another speed than when this one was filled.
             filler.join(root, rot, gap)
         if calmed is not None:
@@ -181,7 +182,12 @@ def _compose(
 
 
 def _mend(
-    filler: Filler, root: Tensor, rot: Tensor, wanting: Sequence[Gap], gaps: Sequence[Gap], hips: bool
+    filler: Filler,
+    root: np.ndarray,
+    rot: np.ndarray,
+    wanting: Sequence[Gap],
+    gaps: Sequence[Gap],
+    hips: bool,
 ) -> None:
     """What the doctor makes of the gaps with faults, in place, where fewer are left then; it fades in
     from the keyframes. hips: whether their path may change, or legs alone."""
@@ -189,33 +195,32 @@ def _mend(
     healed = heal(before, hips)
     if healed.frames != before.frames:
         return
-    tried_root, tried_rot = root.clone(), rot.clone()
+    tried_root, tried_rot = root.copy(), rot.copy()
     for gap in wanting:
         rows = slice(gap.a + 1, gap.b)
-        t = torch.arange(1, gap.b - gap.a, dtype=root.dtype)
-        near = torch.minimum(t, gap.b - gap.a - t) / filler.own.fps
-        share = (near / FADE_S).clamp_max(1.0)
+        t = np.arange(1, gap.b - gap.a, dtype=root.dtype)
+        near = np.minimum(t, gap.b - gap.a - t) / filler.own.fps
+        share = np.minimum(near / FADE_S, 1.0)
         share = smoothstep(share)[:, None]
-        tried_root[rows] = torch.lerp(root[rows], torch.tensor(healed.root_pos[rows]), share)
-        other = torch.tensor(healed.rot[rows])
-        tried_rot[rows] = slerp(rot[rows], other, share.expand(other.shape[:2]))
+        tried_root[rows] = lerp(root[rows], healed.root_pos[rows], share)
+        other = healed.rot[rows]
+        tried_rot[rows] = slerp(rot[rows], other, share)
     fewest = _count(judged(before, gaps))
     able = [g for g in wanting if _speed(filler, tried_root, tried_rot, g) <= 1.0][:MENDED]
     # What is mended in one gap may be a fault in the next: all at once, else one by one.
     for some in (able, *([gap] for gap in able)):
-        was = root.clone(), rot.clone()
+        was = root.copy(), rot.copy()
         for gap in some:
             rows = slice(gap.a + 1, gap.b)
             root[rows], rot[rows] = tried_root[rows], tried_rot[rows]
         for gap in gaps:
             # A gap begins in the speed in which the one before it ends.
             at = max(0, gap.a - 1)
-            if gap in some or not torch.equal(was[1][at], rot[at]):
+            if gap in some or not np.array_equal(was[1][at], rot[at]):
                 filler.join(root, rot, gap)
         now = _count(judged(_clip(filler, root, rot), gaps))
         if now >= fewest:
-            root.copy_(was[0])
-            rot.copy_(was[1])
+            root[:], rot[:] = was
         elif some is able:
             return
         else:
@@ -228,15 +233,15 @@ def _count(found: Mapping[Gap, Sequence[GapFault]]) -> tuple[int, float]:
     return len(each), distance(each.values())
 
 
-def _speed(filler: Filler, root: Tensor, rot: Tensor, gap: Gap) -> float:
+def _speed(filler: Filler, root: np.ndarray, rot: np.ndarray, gap: Gap) -> float:
     """The fastest joint of a gap, by its limit."""
     rows = slice(gap.a, gap.b + 1)
     return excess(filler.own.skeleton, filler.limits, (root[rows], rot[rows]), filler.own.fps)[0]
 
 
-def _cut(root: Tensor, rot: Tensor, gap: Gap) -> Motion:
-    return root[gap.a + 1 : gap.b].clone(), rot[gap.a + 1 : gap.b].clone()
+def _cut(root: np.ndarray, rot: np.ndarray, gap: Gap) -> Motion:
+    return root[gap.a + 1 : gap.b].copy(), rot[gap.a + 1 : gap.b].copy()
 
 
-def _clip(filler: Filler, root: Tensor, rot: Tensor) -> Clip:
-    return filler.own.replaced(root_pos=root.numpy(), rot=rot.numpy(), contacts=())
+def _clip(filler: Filler, root: np.ndarray, rot: np.ndarray) -> Clip:
+    return filler.own.replaced(root_pos=root, rot=rot, contacts=())

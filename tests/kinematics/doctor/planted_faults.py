@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from poise.motion import Clip, shifted
 from poise.motion.rotations import quat_mul, rotvec_to_quat
@@ -27,10 +26,12 @@ def excursion(clip: Clip, first: int, last: int, metres: float = 0.5) -> Clip:
 
 def turned(clip: Clip, joint: str, first: int, last: int, rotvec: tuple[float, float, float]) -> Clip:
     """A joint turned about an axis of its own in frames `first` to `last`."""
-    rot, j = torch.tensor(clip.rot), clip.skeleton.index(joint)
-    turn = rotvec_to_quat(torch.tensor(rotvec, dtype=torch.float64))
-    rot[first : last + 1, j] = quat_mul(rot[first : last + 1, j], turn.expand(last + 1 - first, 4))
-    return clip.replaced(rot=rot.numpy())
+    rot, j = clip.rot.copy(), clip.skeleton.index(joint)
+    turn = rotvec_to_quat(np.asarray(rotvec, dtype=float))
+    rot[first : last + 1, j] = quat_mul(
+        rot[first : last + 1, j], np.broadcast_to(turn, (last + 1 - first, 4))
+    )
+    return clip.replaced(rot=rot)
 
 
 def drift(clip: Clip, speed: float) -> Clip:
@@ -47,10 +48,10 @@ def lifted(clip: Clip, metres: float) -> Clip:
 def shaken(clip: Clip, joint: str, first: int, last: int, degrees: float, seed: int = 0) -> Clip:
     """White noise of `degrees` per axis on one joint's rotation in frames `first` to `last`."""
     rng = np.random.default_rng(seed)
-    rot, j = torch.tensor(clip.rot), clip.skeleton.index(joint)
-    noise = torch.tensor(rng.normal(0.0, np.radians(degrees), (last + 1 - first, 3)))
+    rot, j = clip.rot.copy(), clip.skeleton.index(joint)
+    noise = rng.normal(0.0, np.radians(degrees), (last + 1 - first, 3))
     rot[first : last + 1, j] = quat_mul(rot[first : last + 1, j], rotvec_to_quat(noise))
-    return clip.replaced(rot=rot.numpy())
+    return clip.replaced(rot=rot)
 
 
 def repeated(clip: Clip, frame: int, count: int) -> Clip:

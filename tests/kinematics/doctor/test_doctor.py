@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from planted_faults import (
     cut,
     drift,
@@ -66,7 +65,7 @@ def apart_m(a: Clip, b: Clip) -> float:
 
 
 def apart_deg(a: Clip, b: Clip) -> float:
-    return math.degrees(float(quat_distance(torch.tensor(a.rot), torch.tensor(b.rot)).max()))
+    return math.degrees(float(quat_distance(a.rot, b.rot).max()))
 
 
 def foot(clip: Clip) -> str:

@@ -8,7 +8,6 @@ from importlib.resources import as_file, files
 
 import numpy as np
 import pytest
-import torch
 from planted_faults import exchanged, lifted
 
 from poise.body import Anatomy
@@ -51,16 +50,16 @@ def test_kinds_come_in_their_order_and_know_their_unit() -> None:
 @pytest.mark.parametrize("fps", [30.0, 120.0])
 def test_noise_has_its_own_size_and_motion_has_none(fps: float) -> None:
     rng = np.random.default_rng(1)
-    t = torch.arange(400) / fps
-    motion = 0.1 * torch.stack((torch.sin(9.0 * t), torch.cos(7.0 * t), t), -1).double()
+    t = np.arange(400) / fps
+    motion = 0.1 * np.stack((np.sin(9.0 * t), np.cos(7.0 * t), t), -1).astype(float)
     assert not trembling(motion, fps, 1e-6)[1].any()
-    noisy = motion + torch.tensor(rng.normal(0.0, 0.01, (400, 3)))
+    noisy = motion + rng.normal(0.0, 0.01, (400, 3))
     size, bad = trembling(noisy, fps, 0.003)
     assert bad.mean() > 0.95
     # Three axes of deviation s give vectors of about 1.5 s in the median.
     assert np.median(size) == pytest.approx(0.0155, rel=0.15)
     # A single spike is no noise.
-    spike = motion.clone()
+    spike = motion.copy()
     spike[200] += 0.2
     assert not trembling(spike, fps, 0.003)[1].any()
 
@@ -93,9 +92,9 @@ def test_a_standing_foot_does_not_slip_and_a_locked_one_stays(walk: Clip) -> Non
     others = [j for j in range(len(walk.skeleton)) if j not in legs]
     np.testing.assert_array_equal(locked.rot[:, others], broken.rot[:, others])
     foot = walk.skeleton.index("LeftFoot")
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(walk.frames, 3)
-    tilts = [quat_rotate_inv(torch.tensor(c.world()[1][:, foot]), up) for c in (locked, broken)]
-    torch.testing.assert_close(*tilts, atol=1e-9, rtol=0)
+    up = np.broadcast_to(np.array([0.0, 0.0, 1.0], dtype=float), (walk.frames, 3))
+    tilts = [quat_rotate_inv(c.world()[1][:, foot], up) for c in (locked, broken)]
+    np.testing.assert_allclose(*tilts, atol=1e-9, rtol=0)
     lengths = [
         np.linalg.norm(np.diff(c.positions()[:, [1, 2, 3]], axis=1), axis=-1) for c in (walk, locked)
     ]
@@ -108,10 +107,10 @@ def test_sides_are_told_by_feet_knees_and_travel(walk: Clip) -> None:
     other = exchanged(walk)
     assert max(side_votes(other, anatomy_of(other)).values()) < -0.9
     # Lying on the back changes nothing: the trunk tells what is up.
-    turn = rotvec_to_quat(torch.tensor([0.0, math.pi / 2, 0.0], dtype=torch.float64))
-    rot = torch.tensor(walk.rot)
-    rot[:, 0] = quat_mul(turn.expand(walk.frames, 4), rot[:, 0])
-    lying = walk.replaced(rot=rot.numpy())
+    turn = rotvec_to_quat(np.array([0.0, math.pi / 2, 0.0], dtype=float))
+    rot = walk.rot.copy()
+    rot[:, 0] = quat_mul(np.broadcast_to(turn, (walk.frames, 4)), rot[:, 0])
+    lying = walk.replaced(rot=rot)
     assert min(v for k, v in side_votes(lying, anatomy_of(lying)).items() if k != "travel") > 0.9
 
 
@@ -123,12 +122,12 @@ def test_limits_of_the_file_are_those_of_its_own_angles() -> None:
     )
     source = Source(format="asf-amc", up_axis="Z", channels=channels)
     skeleton = Skeleton(("root", "knee"), (-1, 0), np.array([[0, 0, 0], [0, 0, 1.0]]), (), source)
-    angle = torch.zeros(60, 3, dtype=torch.float64)
+    angle = np.zeros((60, 3))
     angle[20:40, 0] = 90 * degrees
-    rot = torch.zeros(60, 2, 4, dtype=torch.float64)
+    rot = np.zeros((60, 2, 4))
     rot[..., 0] = 1.0
     rot[:, 1] = rotvec_to_quat(angle)
-    (fault,) = limit_faults(Clip(skeleton, np.zeros((60, 3)), rot.numpy(), 30.0))
+    (fault,) = limit_faults(Clip(skeleton, np.zeros((60, 3)), rot, 30.0))
     assert (fault.joint, fault.start, fault.stop) == ("knee", 20, 39)
     assert fault.size == pytest.approx(70.0, abs=1e-6)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.signal import butter, sosfiltfilt
 
 from poise.formats import read_clip
@@ -53,10 +52,8 @@ def dirty(clip: Clip, mm: float, kind: Callable[..., np.ndarray], seed: int = 0)
     noise = kind(np.random.default_rng(seed), clip.frames, len(clip.skeleton) + 1, clip.fps)
 
     def made(size: float) -> Clip:
-        rot = quat_mul(torch.tensor(clip.rot), rotvec_to_quat(torch.tensor(size * noise[:, :-1])))
-        return clip.replaced(
-            rot=unwrap_quats(rot).numpy(), root_pos=clip.root_pos + 0.2 * size * noise[:, -1]
-        )
+        rot = quat_mul(clip.rot, rotvec_to_quat(size * noise[:, :-1]))
+        return clip.replaced(rot=unwrap_quats(rot), root_pos=clip.root_pos + 0.2 * size * noise[:, -1])
 
     size = 0.02
     for _ in range(4):
@@ -133,10 +130,10 @@ def test_the_spectrum_of_white_noise_and_of_a_tone() -> None:
 
 
 def test_spikes_and_held_joints_are_filled_in(walk: Clip) -> None:
-    rot = unwrap_quats(torch.tensor(walk.rot)).numpy().copy()
+    rot = unwrap_quats(walk.rot).copy()
     arm, leg = (walk.skeleton.index(n) for n in ("LeftArm", "RightUpLeg"))
-    turn = rotvec_to_quat(torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64))
-    rot[20, arm] = quat_mul(torch.tensor(rot[20, arm]), turn).numpy()
+    turn = rotvec_to_quat(np.array([0.0, 0.0, 1.2], dtype=float))
+    rot[20, arm] = quat_mul(rot[20, arm], turn)
     rot[37:46, leg] = rot[36, leg]
     broken = walk.replaced(rot=rot)
     assert sorted(find_lost(broken, rot)) == [("held", leg, 37, 45), ("spike", arm, 20, 20)]
@@ -154,10 +151,10 @@ def test_a_trembling_clip_loses_its_spikes_at_either_end(walk: Clip, frame: int)
     # 20 degrees of a joint that carries the trunk; too little to be sure of in a clip without noise.
     spine = walk.skeleton.index("Spine")
     shaken = dirty(walk, 8.0, tone(5.0))
-    rot = unwrap_quats(torch.tensor(shaken.rot))
-    leap = rotvec_to_quat(torch.tensor([0.35, 0.0, 0.0], dtype=torch.float64))
+    rot = unwrap_quats(shaken.rot)
+    leap = rotvec_to_quat(np.array([0.35, 0.0, 0.0], dtype=float))
     rot[frame, spine] = quat_mul(rot[frame, spine], leap)
-    found, whole = noise_faults(shaken.replaced(rot=rot.numpy()))
+    found, whole = noise_faults(shaken.replaced(rot=rot))
     at = frame % walk.frames
     assert [(f.joint, f.start) for f in found if f.kind == "spike"] == [("Spine", at)]
     off = np.linalg.norm(denoise(whole).positions() - walk.positions(), axis=-1)[at].mean()
@@ -176,9 +173,7 @@ def test_what_is_missing_lies_on_the_smoothest_curve() -> None:
 def test_a_long_clip_is_smoothed_by_pieces_that_meet(walk: Clip) -> None:
     there = np.concatenate([np.arange(walk.frames), np.arange(walk.frames - 2, 0, -1)])
     order = np.resize(there, 3000)
-    long = walk.replaced(
-        root_pos=walk.root_pos[order], rot=unwrap_quats(torch.tensor(walk.rot[order])).numpy()
-    )
+    long = walk.replaced(root_pos=walk.root_pos[order], rot=unwrap_quats(walk.rot[order]))
     broken = dirty(long, 25.0, white)
     fixed = denoise(broken)
     assert off_mm(fixed, long) < filtered(broken, long)
@@ -222,8 +217,8 @@ def test_small_spikes_are_found_where_there_are_large_ones(walk: Clip) -> None:
     hit[0, 3] = hit[-1, 4] = hit[40, 5] = True
     turn = 0.6 * rng.standard_normal((walk.frames, len(walk.skeleton), 3)) * hit
     turn[40, 5] = (0.0, 3.1, 0.0)
-    rot = quat_mul(torch.tensor(walk.rot), rotvec_to_quat(torch.tensor(turn)))
-    broken = walk.replaced(rot=rot.numpy())
+    rot = quat_mul(walk.rot, rotvec_to_quat(turn))
+    broken = walk.replaced(rot=rot)
     assert off_mm(broken, walk) > 20.0
     assert off_mm(refill(broken), walk) < 2.0
 
@@ -323,23 +318,23 @@ def test_what_the_doctor_found_is_not_looked_for_again(
 
 
 def test_a_twist_that_the_next_joint_undoes_is_no_spike(walk: Clip) -> None:
-    skeleton, rot = walk.skeleton, torch.tensor(walk.rot)
+    skeleton, rot = walk.skeleton, walk.rot
     arm, fore = skeleton.index("LeftArm"), skeleton.index("LeftForeArm")
     hand = skeleton.index("LeftHand")
-    bone = torch.tensor(skeleton.offsets[fore] / np.linalg.norm(skeleton.offsets[fore]))
-    turned = rot.clone()
+    bone = skeleton.offsets[fore] / np.linalg.norm(skeleton.offsets[fore])
+    turned = rot.copy()
     for frame in (20, 41, 60):
         turned[frame, arm] = quat_mul(rot[frame, arm], rotvec_to_quat(1.2 * bone))
         turned[frame, fore] = quat_mul(rotvec_to_quat(-1.2 * bone), rot[frame, fore])
-    twisted = walk.replaced(rot=unwrap_quats(turned).numpy())
+    twisted = walk.replaced(rot=unwrap_quats(turned))
     np.testing.assert_allclose(twisted.positions(), walk.positions(), atol=1e-9)
-    assert not find_lost(twisted, unwrap_quats(turned).numpy())
+    assert not find_lost(twisted, unwrap_quats(turned))
     assert np.abs(refill(twisted).positions() - walk.positions())[:, hand].max() < 1e-9
     # The same leap of the arm alone is one.
-    leaping = turned.clone()
+    leaping = turned.copy()
     leaping[:, fore] = rot[:, fore]
-    alone = walk.replaced(rot=unwrap_quats(leaping).numpy())
-    lost = find_lost(alone, unwrap_quats(leaping).numpy())
+    alone = walk.replaced(rot=unwrap_quats(leaping))
+    lost = find_lost(alone, unwrap_quats(leaping))
     assert {("spike", arm, t, t) for t in (20, 41, 60)} <= set(lost)
 
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import find_anatomy, generate_table
 from poise.formats import read_clip
@@ -16,6 +15,7 @@ from poise.kinematics.repair.turns import Flip, neutral_pose, unflip
 from poise.motion import Clip
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul, rotvec_to_quat
 from poise.motion.smoothing import find_runs
+from poise.motion.vectors import norm
 from toy_human import human, swing
 
 ANATOMY = find_anatomy(human())
@@ -30,15 +30,15 @@ def length(found: Flip) -> int:
 
 def flipped(clip: Clip, joint: int, start: int, stop: int, axis: tuple, angle: float = math.pi) -> Clip:
     """The clip with a joint turned about an axis of its own in frames `start` to `stop - 1`."""
-    unit = torch.tensor(axis, dtype=torch.float64)
-    rot = torch.tensor(clip.rot)
-    half = rotvec_to_quat(angle * unit / unit.norm())
-    rot[start:stop, joint] = quat_mul(rot[start:stop, joint], half.expand(stop - start, 4))
-    return clip.replaced(rot=rot.numpy())
+    unit = np.asarray(axis, dtype=float)
+    rot = clip.rot.copy()
+    half = rotvec_to_quat(angle * unit / norm(unit))
+    rot[start:stop, joint] = quat_mul(rot[start:stop, joint], np.broadcast_to(half, (stop - start, 4)))
+    return clip.replaced(rot=rot)
 
 
 def apart_deg(a: Clip, b: Clip) -> float:
-    gap = quat_angle(quat_mul(quat_conj(torch.tensor(a.rot)), torch.tensor(b.rot)))
+    gap = quat_angle(quat_mul(quat_conj(a.rot), b.rot))
     return math.degrees(float(gap.max()))
 
 
@@ -100,10 +100,10 @@ def test_what_a_foot_reaches_and_what_moves_slowly_stays(clip):
     pointed = flipped(clip, FOOT, 20, 50, AXES["across"], math.radians(90.0))
     assert unflip(pointed, ANATOMY, TRUNK_SPEED) == (pointed, ())
     # A turn all the way round within a second is strange, but no jump.
-    rot = torch.tensor(clip.rot)
-    once = torch.linspace(0, 2 * math.pi, clip.frames, dtype=torch.float64)
-    rot[:, FOOT] = quat_mul(rot[:, FOOT], rotvec_to_quat(once[:, None] * torch.tensor([[0, 1.0, 0]])))
-    around = clip.replaced(rot=rot.numpy())
+    rot = clip.rot.copy()
+    once = np.linspace(0, 2 * math.pi, clip.frames)
+    rot[:, FOOT] = quat_mul(rot[:, FOOT], rotvec_to_quat(once[:, None] * np.array([[0, 1.0, 0]])))
+    around = clip.replaced(rot=rot)
     assert unflip(around, ANATOMY, TRUNK_SPEED) == (around, ())
 
 
@@ -126,7 +126,7 @@ def test_neutral_is_the_rest_pose_where_it_stands(data_dir):
     assert neutral_pose(swing(), ANATOMY)[1]
     folded = read_clip(data_dir / "other/bandai_bvh/dataset-1_walk_normal_001.bvh")
     mean, stands = neutral_pose(folded, find_anatomy(folded.skeleton))
-    assert not stands and torch.allclose(mean.norm(dim=-1), torch.ones(len(mean), dtype=mean.dtype))
+    assert not stands and np.allclose(norm(mean), np.ones(len(mean), dtype=mean.dtype))
 
 
 def test_spells():
@@ -167,7 +167,7 @@ def test_the_feet_of_real_clips_are_turned_back(data_dir, clip_name, foot, least
     clip = read_clip(folder / f"{clip_name}.amc", skeleton=folder / "08.asf")
     fixed, report = clean_clip(clip)
     assert sum(length(f) for f in report.flips if f.joint == foot) >= least
-    away = quat_angle(torch.tensor(fixed.rot[:, clip.skeleton.index(foot)]))
+    away = quat_angle(fixed.rot[:, clip.skeleton.index(foot)])
     assert math.degrees(float(away.max())) < 120.0
 
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import BodyTable, generate_table
 from poise.formats import read_clip
@@ -28,8 +27,8 @@ def posed(seconds: float = 3.0, lean: float = 0.0, **angles: float) -> Clip:
     for name, degrees in {"Hips": lean, **angles}.items():
         for joint in (name, f"Left{name}", f"Right{name}"):
             if joint in human().names:
-                angle = torch.full((clip.frames,), math.radians(degrees), dtype=torch.float64)
-                rot[:, human().index(joint)] = turn("Y", angle).numpy()
+                angle = np.full((clip.frames,), math.radians(degrees))
+                rot[:, human().index(joint)] = turn("Y", angle)
     return clip.replaced(rot=rot, root_pos=np.tile(clip.root_pos[0], (clip.frames, 1)))
 
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import find_anatomy
 from poise.kinematics.repair import speeds
@@ -28,21 +27,21 @@ ANATOMY = find_anatomy(human())
 
 def twisted(clip: Clip, angles: np.ndarray, joint: int = JOINT) -> Clip:
     """The clip with a joint turned by `angles (T)` rad about its long axis."""
-    rot = torch.tensor(clip.rot)
-    rot[:, joint] = quat_mul(rot[:, joint], turn("Z", torch.tensor(angles)))
-    return clip.replaced(rot=rot.numpy())
+    rot = clip.rot.copy()
+    rot[:, joint] = quat_mul(rot[:, joint], turn("Z", angles))
+    return clip.replaced(rot=rot)
 
 
 def apart(a: Clip, b: Clip) -> np.ndarray:
     """Angle `(T, J)` rad between the local rotations of two clips."""
-    return quat_angle(quat_mul(quat_conj(torch.tensor(a.rot)), torch.tensor(b.rot))).numpy()
+    return quat_angle(quat_mul(quat_conj(a.rot), b.rot))
 
 
 def fastest(clip: Clip) -> np.ndarray:
     """The largest speed of every joint, rad/s."""
-    rot = torch.tensor(clip.rot)
+    rot = clip.rot.copy()
     steps = quat_angle(quat_mul(quat_conj(rot[:-1]), rot[1:]))
-    return steps.max(0).values.numpy() * clip.fps
+    return steps.max(0) * clip.fps
 
 
 @pytest.fixture
@@ -52,13 +51,13 @@ def clip() -> Clip:
 
 def test_a_repair_that_jerks_the_body_more_is_undone(clip):
     """The hips turn for one frame, and what hangs on them turns back: hardly anything moves."""
-    turns = torch.zeros(clip.frames, dtype=torch.float64)
+    turns = np.zeros(clip.frames)
     turns[50] = 0.3
-    rot = torch.tensor(clip.rot)
+    rot = clip.rot.copy()
     for name, way in (("Hips", turns), ("Spine", -turns), ("LeftUpLeg", -turns), ("RightUpLeg", -turns)):
         j = clip.skeleton.index(name)
         rot[:, j] = quat_mul(turn("X", way), rot[:, j])
-    broken = clip.replaced(rot=rot.numpy())
+    broken = clip.replaced(rot=rot)
     mended, found = limit_speeds(broken, ANATOMY)
     # Hips may be as fast as that, a trunk and thighs may not.
     assert {r.joint for r in found} == {"Spine", "LeftUpLeg", "RightUpLeg"}

@@ -6,7 +6,6 @@ from importlib.resources import as_file, files
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import BodyTable, generate_table
 from poise.formats import read_clip
@@ -46,9 +45,9 @@ def standing(walk: Clip, table: BodyTable, frames: int = 60) -> Clip:
 
 def _lowest(clip: Clip, table: BodyTable) -> np.ndarray:
     """Heights `(T, 2)` of the feet."""
-    pos, quat = (torch.tensor(x)[:, [r.joint for r in table.rows]] for x in clip.world())
+    pos, quat = (x[:, [r.joint for r in table.rows]] for x in clip.world())
     feet = [i for i, r in enumerate(table.rows) if r.kind == "foot"]
-    return lowest_height(table, pos, quat)[:, feet].numpy()
+    return lowest_height(table, pos, quat)[:, feet]
 
 
 def test_what_stands_still_is_left_alone(walk: Clip, table: BodyTable) -> None:
@@ -80,9 +79,9 @@ def test_a_turning_body_keeps_its_soles_from_turning(walk: Clip, table: BodyTabl
     turn = np.stack((np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)), -1)
     from poise.motion.rotations import quat_mul
 
-    rot = torch.tensor(still.rot)
-    rot[:, 0] = quat_mul(torch.tensor(turn), rot[:, 0])
-    turning = still.replaced(rot=rot.numpy())
+    rot = still.rot.copy()
+    rot[:, 0] = quat_mul(turn, rot[:, 0])
+    turning = still.replaced(rot=rot)
     held, _ = hold_feet(turning, table)
     assert slide(held, table) < slide(turning, table) / 5
 
@@ -124,11 +123,11 @@ def test_a_foot_whose_leg_would_whip_is_left(
     assert not moved.left and np.abs(held.rot - walk.rot).max() > 1e-4
     before = Clip.positions
 
-    def swept(*told: object) -> torch.Tensor:
+    def swept(*told: object) -> np.ndarray:
         """Legs that are led turn by half a turn from one frame to the next."""
         rot = led(*told)  # type: ignore[arg-type]
         foot = next(iter(told[3]))  # type: ignore[call-overload]
-        rot[1::2, walk.skeleton.parents[foot]] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=rot.dtype)
+        rot[1::2, walk.skeleton.parents[foot]] = np.array([0.0, 1.0, 0.0, 0.0], dtype=rot.dtype)
         return rot
 
     monkeypatch.setattr(feet_hold, "led", swept)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import generate_table
 from poise.kinematics.feet import level_feet
@@ -14,20 +13,20 @@ from toy_human import swing
 
 
 def rolled(clip: Clip, joint: int, degrees: float) -> Clip:
-    axis = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    turn = axis_angle_to_quat(axis, torch.tensor(np.radians(degrees)))
-    rot = torch.tensor(clip.rot)
-    rot[:, joint] = quat_mul(rot[:, joint], turn.expand(len(rot), 4))
-    return clip.replaced(rot=rot.numpy())
+    axis = np.array([0.0, 1.0, 0.0], dtype=float)
+    turn = axis_angle_to_quat(axis, np.radians(degrees))
+    rot = clip.rot.copy()
+    rot[:, joint] = quat_mul(rot[:, joint], np.broadcast_to(turn, (len(rot), 4)))
+    return clip.replaced(rot=rot)
 
 
 def tilt(clip: Clip, table, joint: int) -> float:
     """Mean angle between the sole's normal and the vertical, degrees."""
     row = next(r for r in table.rows if r.joint == joint)
     box = next(g for g in row.geoms if g.kind == "box")
-    up = quat_rotate(torch.tensor(box.quat).double(), torch.tensor([0.0, 0.0, 1.0]).double())
-    normal = quat_rotate(torch.tensor(clip.world()[1][:, joint]), up.expand(clip.frames, 3))
-    return float(torch.rad2deg(torch.acos(normal[:, 2].clamp(-1, 1))).mean())
+    up = quat_rotate(np.array(box.quat), np.array([0.0, 0.0, 1.0]))
+    normal = quat_rotate(clip.world()[1][:, joint], np.broadcast_to(up, (clip.frames, 3)))
+    return float(np.rad2deg(np.arccos(np.clip(normal[:, 2], -1, 1))).mean())
 
 
 def test_a_foot_on_its_edge_comes_to_stand_flat_and_goes_back():

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-import torch
+import numpy as np
 
 from poise.kinematics.feet import standing_labels
-from poise.motion.windows import step_contacts
+from poise.synthesis.windows import step_contacts
 
 
-def walk(drift: float, floor: float, frames: int = 120) -> torch.Tensor:
+def walk(drift: float, floor: float, frames: int = 120) -> np.ndarray:
     """An ankle and a toe that stand for 20 frames, sliding by `drift` m/s, and swing for 10."""
-    t = torch.arange(frames, dtype=torch.float64)
+    t = np.arange(frames, dtype=float)
     swing = (t % 30) >= 20
-    x = torch.cumsum(torch.where(swing, 1.5, drift) / 30, 0)
-    lift = torch.where(swing, 0.15 * torch.sin(torch.pi * ((t % 30) - 19.5) / 10).abs(), 0.0)
-    height = torch.tensor([0.08, 0.02], dtype=torch.float64)
+    x = np.cumsum(np.where(swing, 1.5, drift) / 30, 0)
+    lift = np.where(swing, 0.15 * np.abs(np.sin(np.pi * ((t % 30) - 19.5) / 10)), 0.0)
+    height = np.array([0.08, 0.02], dtype=float)
     z = floor + height + lift[:, None]
-    return torch.stack((x[:, None].expand(-1, 2), torch.zeros(frames, 2), z), -1)
+    return np.stack((np.tile(x[:, None], (1, 2)), np.zeros((frames, 2)), z), -1)
 
 
 def test_sliding_feet_stand_on_whatever_floor_they_are() -> None:
     clips = [walk(0.1, 0.0), walk(0.02, 0.03), walk(0.12, -0.02, 90)]
     for clip, labels in zip(clips, standing_labels(clips, 30.0), strict=True):
-        stands = (torch.arange(len(clip)) % 30) < 20
-        assert labels.shape == clip.shape[:2] and labels.dtype == torch.bool
+        stands = (np.arange(len(clip)) % 30) < 20
+        assert labels.shape == clip.shape[:2] and labels.dtype == bool
         # A frame at either end of a spell may go either way.
-        assert (labels == stands[:, None]).double().mean() > 0.9
+        assert (labels == stands[:, None]).astype(float).mean() > 0.9
     # By steps alone the sliding ones never stand.
-    assert step_contacts(clips[0]).double().mean() < 0.05
+    assert step_contacts(clips[0]).astype(float).mean() < 0.05
 
 
 def test_feet_that_never_rest_have_no_floor_to_stand_on() -> None:

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import torch
+import numpy as np
 
 from poise.kinematics.steps import CLEAR_M, LEAST_M, lock_feet, missing_steps, rises
 from poise.motion.rotations import forward_kinematics
-from poise.motion.windows import foot_joints
+from poise.motion.vectors import norm
+from poise.synthesis.windows import foot_joints
 from toy_human import swing, turn
 
 FPS = 30.0
 
 
-def sliding(frames: int, *far: float, at: float = 0.5) -> torch.Tensor:
+def sliding(frames: int, *far: float, at: float = 0.5) -> np.ndarray:
     """Soles `(T, K, 2, 3)` of feet that slide `far` m forward on the floor, most of it about `at`."""
-    t = torch.linspace(0, 1, frames, dtype=torch.float64)
-    way = torch.sigmoid(12 * (t - at))
+    t = np.linspace(0, 1, frames)
+    way = 1 / (1 + np.exp(-12 * (t - at)))
     way = (way - way[0]) / (way[-1] - way[0])
-    soles = torch.zeros(frames, len(far), 2, 3, dtype=torch.float64)
+    soles = np.zeros((frames, len(far), 2, 3))
     soles[:, :, 1, 0] = 0.15
-    soles[..., 0] += (way[:, None] * torch.tensor(far, dtype=torch.float64))[..., None]
+    soles[..., 0] += (way[:, None] * np.asarray(far, dtype=float))[..., None]
     return soles
 
 
-def standing(frames: int, feet: int) -> torch.Tensor:
-    return torch.ones(frames, feet, dtype=torch.bool)
+def standing(frames: int, feet: int) -> np.ndarray:
+    return np.ones((frames, feet), dtype=bool)
 
 
 def test_a_foot_that_is_elsewhere_at_the_end_steps_when_it_is_moved() -> None:
@@ -69,11 +70,11 @@ def test_feet_that_drag_are_raised_and_others_left() -> None:
     stands[10:22] = False
     soles = sliding(32, 0.4, 0.02)
     up = rises(soles, stands)
-    assert torch.equal(up[:10], torch.zeros(10, 2).double()) and not up[22:].any()
+    assert np.array_equal(up[:10], np.zeros((10, 2)).astype(float)) and not up[22:].any()
     # Foot 1 hardly moves. Foot 0 is clear by what is asked for in the middle of its swing.
     assert not up[:, 1].any() and float(up[:, 0].max()) > 0.9 * CLEAR_M
-    assert float(torch.diff(up[:, 0], n=2).abs().max()) < 0.2 * CLEAR_M
-    high = soles.clone()
+    assert float(np.abs(np.diff(up[:, 0], n=2)).max()) < 0.2 * CLEAR_M
+    high = soles.copy()
     high[10:22, 0, :, 2] = 0.1
     assert not rises(high, stands).any()
     # Half as high: raised by what is missing alone.
@@ -83,21 +84,21 @@ def test_feet_that_drag_are_raised_and_others_left() -> None:
 
 def test_kept_feet_that_are_apart_step_instead_of_sliding() -> None:
     clip = swing(1.0, speed=0.3)
-    skeleton, (root, rot) = clip.skeleton, clip.tensors()
+    skeleton, (root, rot) = clip.skeleton, clip.arrays()
     for side in ("Left", "Right"):
-        rot[:, skeleton.index(f"{side}UpLeg")] = turn("Y", torch.full((31,), -0.4).double())
-        rot[:, skeleton.index(f"{side}Leg")] = turn("Y", torch.full((31,), 0.8).double())
+        rot[:, skeleton.index(f"{side}UpLeg")] = turn("Y", np.full((31,), -0.4).astype(float))
+        rot[:, skeleton.index(f"{side}Leg")] = turn("Y", np.full((31,), 0.8).astype(float))
     root[:, 2] -= 0.02
-    feet, offsets = foot_joints(skeleton), torch.tensor(skeleton.offsets.copy())
-    free = torch.ones(31, dtype=torch.bool)
+    feet, offsets = foot_joints(skeleton), skeleton.offsets.copy()
+    free = np.ones(31, dtype=bool)
     free[[0, 30]] = False
-    held = lock_feet(skeleton, feet, root, rot, torch.ones(31, 4, dtype=torch.bool), free, FPS)
+    held = lock_feet(skeleton, feet, root, rot, np.ones((31, 4), dtype=bool), free, FPS)
     before, after = (forward_kinematics(skeleton.parents, offsets, root, r)[0] for r in (rot, held))
-    assert torch.equal(held[0], rot[0]) and torch.equal(held[30], rot[30])
+    assert np.array_equal(held[0], rot[0]) and np.array_equal(held[30], rot[30])
     low, moving = [], []
     for toe in (feet[1], feet[3]):
-        height = after[:, toe, 2] - before[:, toe, 2].amin()
-        speed = torch.diff(after[:, toe, :2], dim=0).norm(dim=-1) * FPS
+        height = after[:, toe, 2] - before[:, toe, 2].min()
+        speed = norm(np.diff(after[:, toe, :2], axis=0)) * FPS
         low.append(float(speed[(height[1:] < 0.01) & (height[:-1] < 0.01)].mean()))
         moving.append(height > 0.02)
     # The body goes at 0.3 m/s, and so would feet that slide.

@@ -7,11 +7,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyConfig, BodyTable, generate_table
-from poise.kinematics.ik_body import IkBody, ik_body, rotate
+from poise.kinematics.ik_bodies import IkBody, ik_body, rotate
 from poise.motion import Skeleton
 from poise.motion.rotations import matrix_to_quat
 
@@ -60,7 +58,7 @@ def paper_humanoid(
         offsets.append(AXES @ _offset(body, p, parent) if parent >= 0 else np.zeros(3))
     made = Skeleton(tuple(body.points[p] for p in points), tuple(parents), np.array(offsets))
     out = generate_table(made, BodyConfig(preset="generic"))
-    quat = tuple(float(x) for x in matrix_to_quat(torch.tensor(AXES)))
+    quat = tuple(float(x) for x in matrix_to_quat(AXES))
     changed = [replace(r, frame=quat) if r.order else r for r in out.rows]
     if one_hinge:
         for i, r in enumerate(changed):
@@ -72,23 +70,23 @@ def paper_humanoid(
 
 def _offset(body: IkBody, point: int, parent: int) -> np.ndarray:
     """Place of a point in its parent, T-pose, as (left, up, forward) m."""
-    bone = (body.rest_pos[point] - body.rest_pos[parent]).numpy()
+    bone = body.rest_pos[point] - body.rest_pos[parent]
     if parent in body.clusters:
         # Pelvis and chest keep the shape that they have.
-        return body.trunk.numpy().T @ bone
+        return body.trunk.T @ bone
     along = np.array(_ALONG[body.table.rows[parent].kind])
     if body.table.rows[parent].side == "right":
         along[0] = -along[0]
     return along / np.linalg.norm(along) * np.linalg.norm(bone)
 
 
-def body_points(body: IkBody, pos: Tensor, rot: Tensor) -> Tensor:
+def body_points(body: IkBody, pos: np.ndarray, rot: np.ndarray) -> np.ndarray:
     """World positions `(T, P, 3)` of points; bodies at `pos (T, R, 3)` turned by `rot (T, R, 3, 3)`."""
     out = [pos]
     for foot, toe in sorted(body.toes.items(), key=lambda item: item[1]):
         local = body.rest_rot[foot].T @ (body.rest_pos[toe] - body.rest_pos[foot])
         out.append((pos[:, foot] + rotate(rot[:, foot], local))[:, None])
-    return torch.cat(out, 1)
+    return np.concatenate(out, 1)
 
 
 def count_jumps(angles: np.ndarray, limit: float = math.pi / 2) -> np.ndarray:

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from paper_humanoid import body_points, count_jumps, paper_humanoid
 
 import toy_human
@@ -39,8 +38,8 @@ def t_pose(one_hinge: bool = False) -> IkBody:
 
 def pose(body: IkBody, q: np.ndarray) -> np.ndarray:
     """World positions `(T, P, 3)` of a body's points."""
-    state = Kinematics(body.table)(torch.tensor(q))
-    return body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
+    state = Kinematics(body.table)(q)
+    return body_points(body, state.pos, quat_to_matrix(state.quat))
 
 
 def random_motion(body: IkBody, frames: int, seed: int, size: float = 0.6) -> np.ndarray:
@@ -50,8 +49,8 @@ def random_motion(body: IkBody, frames: int, seed: int, size: float = 0.6) -> np
     t = np.linspace(0, 1, frames)[:, None]
     q = np.zeros((frames, 7 + n))
     q[:, :3] = rng.normal(size=3) + t * rng.normal(size=3)
-    turn = torch.tensor(rng.normal(size=4) + t * rng.normal(size=4))
-    q[:, 3:7] = normalize(turn).numpy()
+    turn = rng.normal(size=4) + t * rng.normal(size=4)
+    q[:, 3:7] = normalize(turn)
     q[:, 7:] = size * np.sin(rng.uniform(0, 6, n) + rng.uniform(1, 5, n) * t)
     return q
 
@@ -67,7 +66,7 @@ def test_positions_of_any_pose_come_back(body, seed):
     wanted = pose(body, q)
     found = analytic_ik(wanted, body)
     assert distance_mm(body, found, wanted).max() < 1e-6
-    apart = quat_angle(quat_mul(quat_conj(torch.tensor(q[:, 3:7])), torch.tensor(found[:, 3:7])))
+    apart = quat_angle(quat_mul(quat_conj(q[:, 3:7]), found[:, 3:7]))
     assert float(apart.max()) < 1e-6
 
 
@@ -124,12 +123,12 @@ def test_arms_that_circle_overhead_do_not_jump():
     # A straight arm that swings full circles passes every lock and has no bend plane at all.
     body = toy()
     clip = toy_human.swing(seconds=4.0)
-    rot = torch.tensor(clip.rot)
-    t = torch.linspace(0, 4 * math.pi, clip.frames, dtype=torch.float64)
+    rot = clip.rot.copy()
+    t = np.linspace(0, 4 * math.pi, clip.frames)
     for side in ("Left", "Right"):
         rot[:, clip.skeleton.index(f"{side}Arm")] = toy_human.turn("Y", -t)
         rot[:, clip.skeleton.index(f"{side}ForeArm")] = toy_human.turn("Y", 0.0 * t)
-    clip = clip.replaced(rot=rot.numpy())
+    clip = clip.replaced(rot=rot)
     q = clip_ik(clip, body)
     assert (
         distance_mm(body, q, clip.positions()[:, [clip.skeleton.index(n) for n in body.points]]).max()
@@ -140,11 +139,11 @@ def test_arms_that_circle_overhead_do_not_jump():
 
 def test_rotations_decide_what_positions_do_not_show():
     clip = toy_human.swing(seconds=2.0)
-    rot = torch.tensor(clip.rot)
-    twist = 0.5 * torch.sin(torch.linspace(0, 6, clip.frames, dtype=torch.float64))
+    rot = clip.rot.copy()
+    twist = 0.5 * np.sin(np.linspace(0, 6, clip.frames))
     fore = clip.skeleton.index("LeftForeArm")
     rot[:, fore] = quat_mul(rot[:, fore], toy_human.turn("Z", twist))
-    clip = clip.replaced(rot=rot.numpy())
+    clip = clip.replaced(rot=rot)
     body = toy()
     pos, quat = clip.world()
     names = [n for r in body.table.rows for n in r.hinge_names()]

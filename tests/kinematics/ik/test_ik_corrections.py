@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 from paper_humanoid import body_points, count_jumps, paper_humanoid
 
 import toy_human
@@ -62,8 +61,8 @@ def column(body: IkBody, hinge: str) -> int:
 
 
 def pose(body: IkBody, q: np.ndarray) -> np.ndarray:
-    state = Kinematics(body.table)(torch.tensor(q))
-    return body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
+    state = Kinematics(body.table)(q)
+    return body_points(body, state.pos, quat_to_matrix(state.quat))
 
 
 def error_mm(body: IkBody, wanted: np.ndarray, config: IkConfig) -> dict[str, float]:

@@ -6,7 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from paper_humanoid import body_points
 
 import toy_human
@@ -26,8 +25,8 @@ def humanoid():
 
 def points(humanoid, q: np.ndarray) -> dict[str, np.ndarray]:
     body = IkBody.of(humanoid)
-    state = Kinematics(humanoid.table)(torch.tensor(q))
-    at = body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
+    state = Kinematics(humanoid.table)(q)
+    at = body_points(body, state.pos, quat_to_matrix(state.quat))
     return {n: at[:, i] for i, n in enumerate(body.points)}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
 from poise.motion import Clip
 from poise.motion.rotations import euler_to_quat, quat_conj, quat_mul
@@ -61,11 +60,11 @@ def _bend(rot: np.ndarray, names: tuple[str, ...], side: str, way: np.ndarray) -
     thigh = quat_mul(_turn("X", aside), _turn("Y", -ahead - hip))
     shin = _turn("Y", knee)
     for part, turn in (("UpLeg", thigh), ("Leg", shin), ("Foot", quat_conj(quat_mul(thigh, shin)))):
-        rot[:, names.index(side + part)] = turn.numpy()
+        rot[:, names.index(side + part)] = turn
 
 
-def _turn(axis: str, angle: np.ndarray) -> torch.Tensor:
-    return euler_to_quat(torch.tensor(angle)[:, None], axis)
+def _turn(axis: str, angle: np.ndarray) -> np.ndarray:
+    return euler_to_quat(angle[:, None], axis)
 
 
 def in_place(clip: Clip) -> Clip:

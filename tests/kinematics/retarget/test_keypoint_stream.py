@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import BodyTable, generate_table
 from poise.formats import read_clip
@@ -16,7 +15,7 @@ from poise.formats.point_tables import trc_points
 from poise.formats.raw import ReadOptions as Options
 from poise.kinematics import RetargetConfig, retarget
 from poise.kinematics.ground import fit_heights
-from poise.kinematics.retarget.keypoint_goal import KeypointStream, PointBody, StreamConfig
+from poise.kinematics.retargeting.keypoint_goal import KeypointStream, PointBody, StreamConfig
 from poise.motion import Clip, resample, trim
 from poise.motion.keypoints import Keypoints
 from refusals import refused
@@ -31,9 +30,9 @@ def points_of(clip: Clip) -> Keypoints:
 
 def bodies(clip: Clip, table: BodyTable) -> np.ndarray:
     """Positions of the bodies, the whole lifted onto z = 0."""
-    pos, quat = (torch.tensor(x[:, [r.joint for r in table.rows]]) for x in clip.world())
+    pos, quat = (x[:, [r.joint for r in table.rows]] for x in clip.world())
     lift = fit_heights(table, pos, quat, clip.fps).lift_m
-    return (pos + torch.tensor([0.0, 0.0, lift])).numpy()
+    return pos + np.array([0.0, 0.0, lift])
 
 
 def offline(points: Keypoints, onto: Clip, table: BodyTable, contacts: bool) -> np.ndarray:

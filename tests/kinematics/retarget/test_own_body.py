@@ -9,7 +9,7 @@ import pytest
 
 from poise.body import BodyConfig, Humanoid, generate_table, make_humanoid
 from poise.kinematics import place_on_body, retarget
-from poise.kinematics.retarget.own_body import onto_own, own_body, own_skeleton
+from poise.kinematics.retargeting.own_body import onto_own, own_body, own_skeleton
 from poise.motion import Clip, Skeleton
 from poise.motion.roles import map_joints
 from refusals import refused

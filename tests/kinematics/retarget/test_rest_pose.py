@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from poise.formats import read_clip, write_clip
 from poise.kinematics import find_guesses, with_rest_pose
@@ -21,18 +20,18 @@ from toy_human import swing
 def folded(clip: Clip, seed: int = 0) -> Clip:
     """The same motion with the frames of all joints turned at random, so that zero is no pose at all."""
     rng = np.random.default_rng(seed)
-    turns = normalize(torch.tensor(rng.normal(size=(len(clip.skeleton), 4))))
+    turns = normalize(rng.normal(size=(len(clip.skeleton), 4)))
     parents = clip.skeleton.parents
-    world = quat_mul(torch.tensor(clip.world()[1]), turns.expand(clip.frames, -1, -1))
+    world = quat_mul(clip.world()[1], turns)
     local = [world[:, 0]] + [quat_between(world[:, p], world[:, j]) for j, p in enumerate(parents) if j]
-    offsets = torch.tensor(clip.skeleton.offsets)
+    offsets = clip.skeleton.offsets
     above = turns[[max(p, 0) for p in parents]]
     ends = tuple(
-        (j, tuple(quat_rotate_inv(turns[j], torch.tensor(tip, dtype=torch.float64)).tolist()))
+        (j, tuple(quat_rotate_inv(turns[j], np.asarray(tip, dtype=float)).tolist()))
         for j, tip in clip.skeleton.ends
     )
-    skeleton = replace(clip.skeleton, offsets=quat_rotate_inv(above, offsets).numpy(), ends=ends)
-    return clip.replaced(skeleton=skeleton, rot=torch.stack(local, 1).numpy())
+    skeleton = replace(clip.skeleton, offsets=quat_rotate_inv(above, offsets), ends=ends)
+    return clip.replaced(skeleton=skeleton, rot=np.stack(local, 1))
 
 
 def check_t_pose(skeleton: Skeleton) -> None:

@@ -7,16 +7,15 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body.topology import subtree
 from poise.formats import read_clip
 from poise.kinematics import RetargetConfig, retarget
 from poise.kinematics.feet import rest_height
 from poise.kinematics.limbs import match_positions
-from poise.kinematics.retarget.common_pose import common_pose
-from poise.kinematics.retarget.plant import BLEND_S, contact_weight
-from poise.kinematics.retarget.standing import ClipWorld, hinge_axis
+from poise.kinematics.retargeting.common_pose import common_pose
+from poise.kinematics.retargeting.plant import BLEND_S, contact_weight
+from poise.kinematics.retargeting.standing import ClipWorld, hinge_axis
 from poise.motion import Clip, Skeleton, find_roles, resample, trim
 from poise.motion.rotations import (
     euler_to_quat,
@@ -48,28 +47,30 @@ def real(data_dir, name: str) -> Clip:
     return _CACHE[name]
 
 
-def turned(clip: Clip, axes: torch.Tensor | None = None) -> Clip:
+def turned(clip: Clip, axes: np.ndarray | None = None) -> Clip:
     """The same motion on a skeleton of joints with other axes, by default such that it lies folded at
     rest, as LAFAN1's does."""
     if axes is None:
-        generator = torch.Generator().manual_seed(0)
-        axes = torch.randn(len(clip.skeleton), 4, generator=generator, dtype=torch.float64)
+        generator = np.random.default_rng(0)
+        axes = generator.normal(size=(len(clip.skeleton), 4))
     axes = normalize(axes)
     parents = clip.skeleton.parents
     # A joint's world rotation W becomes W A; its child's offset is seen in the frame turned by A.
-    offsets = torch.tensor(clip.skeleton.offsets)
-    rot = torch.tensor(clip.rot)
-    new_offsets, new_rot = offsets.clone(), rot.clone()
+    offsets = clip.skeleton.offsets
+    rot = clip.rot.copy()
+    new_offsets, new_rot = offsets.copy(), rot.copy()
     for j, p in enumerate(parents):
-        before = axes[p] if p >= 0 else torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+        before = axes[p] if p >= 0 else np.array([1.0, 0, 0, 0], dtype=float)
         new_offsets[j] = quat_rotate(quat_conj(before), offsets[j])
-        new_rot[:, j] = quat_mul(quat_mul(quat_conj(before).expand_as(rot[:, j]), rot[:, j]), axes[j])
+        new_rot[:, j] = quat_mul(
+            quat_mul(np.broadcast_to(quat_conj(before), rot[:, j].shape), rot[:, j]), axes[j]
+        )
     ends = tuple(
-        (j, tuple(quat_rotate(quat_conj(axes[j]), torch.tensor(v, dtype=torch.float64)).tolist()))
+        (j, tuple(quat_rotate(quat_conj(axes[j]), np.asarray(v, dtype=float)).tolist()))
         for j, v in clip.skeleton.ends
     )
-    skeleton = Skeleton(clip.skeleton.names, parents, new_offsets.numpy(), ends)
-    return Clip(skeleton, clip.root_pos, normalize(new_rot).numpy(), clip.fps, clip.name, clip.cyclic)
+    skeleton = Skeleton(clip.skeleton.names, parents, new_offsets, ends)
+    return Clip(skeleton, clip.root_pos, normalize(new_rot), clip.fps, clip.name, clip.cyclic)
 
 
 def renamed(skeleton: Skeleton, names: dict[str, str]) -> Skeleton:
@@ -89,7 +90,7 @@ def test_onto_itself_changes_nothing() -> None:
     clip = walk()
     made, report = retarget(clip, clip.skeleton)
     assert np.abs(made.positions() - clip.positions()).max() < 1e-9
-    assert float(quat_distance(*(torch.tensor(c.rot) for c in (made, clip))).max()) < 1e-6
+    assert float(quat_distance(*(c.rot for c in (made, clip))).max()) < 1e-6
     assert report.scale == 1.0 and report.direction_max_deg < 1e-6 and report.end_percent < 1e-9
     assert (made.fps, made.name, made.cyclic) == (clip.fps, clip.name, clip.cyclic)
 
@@ -99,7 +100,7 @@ def test_real_clips_onto_themselves_change_nothing(name: str, data_dir) -> None:
     clip = real(data_dir, name)
     made, _ = retarget(clip, clip)
     assert np.abs(made.positions() - clip.positions()).max() < 1e-7
-    assert float(quat_distance(*(torch.tensor(c.rot) for c in (made, clip))).max()) < math.radians(0.01)
+    assert float(quat_distance(*(c.rot for c in (made, clip))).max()) < math.radians(0.01)
 
 
 def test_a_giant_takes_the_same_steps_at_its_size() -> None:
@@ -128,15 +129,15 @@ def test_other_axes_of_the_joints_do_not_matter() -> None:
         # Elbows and knees turn about the target's own hinge, whatever axes it has.
         for joint in ("LeftForeArm", "RightLeg"):
             j = b.skeleton.index(joint)
-            rot, own = (torch.tensor(c.rot[:, j]) for c in (made, b))
+            rot, own = (c.rot[:, j] for c in (made, b))
             assert float(quat_distance(rot, own).max()) < math.radians(3.0)
 
 
 @pytest.mark.parametrize("axis", ["X", "Y"])
 def test_a_rest_pose_may_lie_on_the_floor(axis: str) -> None:
     clip = walk()
-    quarter = euler_to_quat(torch.tensor([[math.pi / 2]], dtype=torch.float64), axis)
-    lying = turned(clip, quarter.expand(len(clip.skeleton), 4))
+    quarter = euler_to_quat(np.array([[math.pi / 2]], dtype=float), axis)
+    lying = turned(clip, np.broadcast_to(quarter, (len(clip.skeleton), 4)))
     assert np.ptp(lying.skeleton.rest_positions()[:, 2]) < 0.6
     for a, b in ((clip, lying.skeleton), (lying, clip.skeleton)):
         made, report = retarget(a, b)
@@ -178,13 +179,13 @@ def spine(count: int) -> Skeleton:
 def test_the_bend_of_a_spine_is_shared_out(count: int) -> None:
     clip = walk()
     rot = np.array(clip.rot)
-    bend = euler_to_quat(torch.linspace(0, 0.6, clip.frames, dtype=torch.float64)[:, None], "Y").numpy()
+    bend = euler_to_quat(np.linspace(0, 0.6, clip.frames)[:, None], "Y")
     rot[:, clip.skeleton.index("Spine")] = bend
     rot[:, clip.skeleton.index("Chest")] = bend
     made, _ = retarget(clip.replaced(rot=rot), spine(count))
     joints = [made.skeleton.index(f"Spine{k}") for k in range(count)]
-    chest = torch.tensor(made.world()[1][:, joints[-1]])
-    wanted = torch.tensor(clip.replaced(rot=rot).world()[1][:, clip.skeleton.index("Chest")])
+    chest = made.world()[1][:, joints[-1]]
+    wanted = clip.replaced(rot=rot).world()[1][:, clip.skeleton.index("Chest")]
     assert float(quat_distance(chest, wanted).max()) < 1e-6
     # Every joint takes a share in the same direction.
     shares = 2 * np.arctan2(made.rot[-1, joints, 2], made.rot[-1, joints, 0])
@@ -212,20 +213,20 @@ def test_missing_toes_head_and_clavicles_are_no_obstacle() -> None:
 def sway() -> Clip:
     """Both feet stand still under hips that sway."""
     clip = swing(seconds=2.0)
-    root, rot = clip.tensors()
+    root, rot = clip.arrays()
     names = clip.skeleton.names
     for joint in ("Hips", *(f"{s}{x}" for s in ("Left", "Right") for x in ("UpLeg", "Leg"))):
-        rot[:, names.index(joint)] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    stand = clip.replaced(rot=rot.numpy()).positions()[0]
-    t = torch.linspace(0, 4 * math.pi, clip.frames, dtype=torch.float64)
-    root[:, 0], root[:, 1] = 0.05 * torch.sin(t), 0.04 * torch.cos(t)
+        rot[:, names.index(joint)] = np.array([1.0, 0.0, 0.0, 0.0], dtype=float)
+    stand = clip.replaced(rot=rot).positions()[0]
+    t = np.linspace(0, 4 * math.pi, clip.frames)
+    root[:, 0], root[:, 1] = 0.05 * np.sin(t), 0.04 * np.cos(t)
     root[:, 2] = root[:, 2] - 0.06
-    stays: dict[int | str, torch.Tensor] = {
-        j: torch.tensor(stand[j]).expand_as(root)
+    stays: dict[int | str, np.ndarray] = {
+        j: np.broadcast_to(stand[j], root.shape)
         for j in (names.index("LeftFoot"), names.index("RightFoot"))
     }
     held = match_positions(clip.skeleton, rot, root, stays)
-    return clip.replaced(rot=held.numpy(), root_pos=root.numpy())
+    return clip.replaced(rot=held, root_pos=root)
 
 
 def test_standing_feet_stay_where_they_stand() -> None:
@@ -251,14 +252,14 @@ def test_nothing_sinks_deeper_than_in_the_source() -> None:
     # A squat: the legs fold, and the body comes down by as much as they do.
     clip = swing(seconds=1.0)
     frames = clip.frames
-    fold = torch.linspace(0, 1.2, frames, dtype=torch.float64)
+    fold = np.linspace(0, 1.2, frames)
     rot = np.array(clip.rot)
     root = np.array(clip.root_pos)
     for side in ("Left", "Right"):
         for joint, share in (("UpLeg", -1.0), ("Leg", 2.0), ("Foot", -1.0)):
-            turn = euler_to_quat(share * fold[:, None], "Y").numpy()
+            turn = euler_to_quat(share * fold[:, None], "Y")
             rot[:, clip.skeleton.index(side + joint)] = turn
-    root[:, 2] = 0.87 - 0.82 * (1 - np.cos(fold.numpy()))
+    root[:, 2] = 0.87 - 0.82 * (1 - np.cos(fold))
     squat = clip.replaced(rot=rot, root_pos=root)
     offsets = np.array(clip.skeleton.offsets)
     offsets[clip.skeleton.index("LeftToe")] = (0.2, 0.0, -0.09)
@@ -334,7 +335,7 @@ def test_pairs_of_real_skeletons(a: str, b: str, data_dir) -> None:
     assert report.trunk_deg < 5.0
     assert report.slide_mm_s[1] <= 1.1 * report.slide_mm_s[0] + 2.0
     assert report.depth_max_mm[1] <= report.depth_max_mm[0] + 1.0
-    step = quat_distance(torch.tensor(made.rot[1:]), torch.tensor(made.rot[:-1]))
+    step = quat_distance(made.rot[1:], made.rot[:-1])
     assert float(step.max()) < math.radians(60)
 
 
@@ -383,30 +384,30 @@ def test_a_hinge_is_seen_only_where_a_limb_bends() -> None:
     axis = hinge_axis(ClipWorld.of(clip), limb)
     # The toy's elbow turns by negative angles about its y, arms hanging.
     assert axis is not None
-    np.testing.assert_allclose(axis.numpy(), (0, -1, 0), atol=1e-9)
+    np.testing.assert_allclose(axis, (0, -1, 0), atol=1e-9)
     still = np.array(clip.rot)
     still[:, limb[1]] = (1, 0, 0, 0)
     assert hinge_axis(ClipWorld.of(clip.replaced(rot=still)), limb) is None
 
 
 def test_contact_weights_rise_and_fall_smoothly() -> None:
-    contact = torch.zeros(90, dtype=torch.bool)
+    contact = np.zeros(90, dtype=bool)
     contact[40:50] = True
     weight = contact_weight(contact, 60.0)
     assert (weight[40:50] == 1).all()
     reach = round(BLEND_S * 60)
     assert float(weight[: 41 - reach].max()) == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(weight[20:40].flip(0), weight[50:70], atol=1e-12)
-    assert float(weight.diff().abs().max()) < 0.2
-    assert float(contact_weight(torch.zeros(5, dtype=torch.bool), 30.0).max()) == 0
+    np.testing.assert_allclose(np.flip(weight[20:40], 0), weight[50:70], atol=1e-12)
+    assert float(np.abs(np.diff(weight)).max()) < 0.2
+    assert float(contact_weight(np.zeros(5, dtype=bool), 30.0).max()) == 0
 
 
 def test_the_ground_is_where_feet_rest() -> None:
-    t = torch.linspace(0, 4 * math.pi, 240, dtype=torch.float64)
-    points = torch.zeros(240, 2, 3, dtype=torch.float64)
+    t = np.linspace(0, 4 * math.pi, 240)
+    points = np.zeros((240, 2, 3))
     for k, phase in enumerate((0.0, math.pi)):
-        points[:, k, 2] = 0.03 + 0.2 * torch.sin(t + phase).clamp_min(0)
-        points[:, k, 0] = torch.where(torch.sin(t + phase) > 0, t, 0.0)
+        points[:, k, 2] = 0.03 + 0.2 * np.maximum(np.sin(t + phase), 0)
+        points[:, k, 0] = np.where(np.sin(t + phase) > 0, t, 0.0)
     assert rest_height(points, 60.0) == pytest.approx(0.03, abs=2e-3)
 
 

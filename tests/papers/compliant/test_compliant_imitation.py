@@ -12,6 +12,7 @@ import torch
 from poise.env import ImitationEnv
 from poise.env.yielding import DisplacedGoal
 from poise.learn import Amp, AmpConfig
+from poise.learn.amp import mixed_reward
 from poise.motion.rotations import into_heading
 from poise.papers.compliant import imitation_controller as compliant
 from poise.papers.compliant.imitation_controller import CompliantImitation, build, config_of
@@ -93,13 +94,17 @@ def test_the_positional_reward_is_equation_14(made: Imitation) -> None:
 
 
 def test_the_reward_is_a_product(made: Imitation) -> None:
-    trainer = made.trainer(threads=1, style=made.config.style)
+    style = made.config.style
+    assert style is not None and style.product
+    known = torch.tensor([[0.5, float("nan")]])
+    paid, mean = mixed_reward(torch.tensor([[0.4, 1.0]]), known, style)
+    assert paid[0].tolist() == pytest.approx([0.2, 0.5]) and float(mean) == 0.5
+    trainer = made.trainer(threads=1, style=style)
     trainer.iterate()
     amp = trainer.style
     assert isinstance(amp, Amp)
-    amp._style = torch.tensor([[0.5, float("nan")]])
-    paid = amp.reward(torch.tensor([[0.4, 1.0]]))
-    assert paid[0].tolist() == pytest.approx([0.2, 0.5])
+    again = amp.reward(torch.full_like(amp.style_rewards, 0.4))
+    assert torch.equal(again, mixed_reward(torch.tensor(0.4), amp.style_rewards, style)[0])
     with refused("settings-conflict"):
         CompliantImitation(style=AmpConfig())
 

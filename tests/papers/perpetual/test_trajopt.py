@@ -11,7 +11,14 @@ import torch
 
 from poise.env import ImitationEnv, Reference
 from poise.metrics import mpjpe_global
-from poise.papers.perpetual.trajopt import LqrTeacher, TrajectoryOptimizer, TrajOptConfig, segments
+from poise.papers.perpetual.trajopt import (
+    ROWS,
+    LqrTeacher,
+    TrajectoryOptimizer,
+    TrajOptConfig,
+    at_once,
+    segments,
+)
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import build
 from poise.recipes.residual_force_settings import ResidualForce
@@ -64,10 +71,16 @@ def test_clips_are_found_as_if_each_were_alone(make_task, monkeypatch: pytest.Mo
     together = search(make_task(*clips))
     monkeypatch.setattr("poise.papers.perpetual.trajopt.ROWS", 5)
     apart = search(make_task(*clips))
-    assert len(together._parts()) == 1 or len(apart._parts()) == 2
+    assert at_once(together.lengths.tolist(), ROWS) == [[0, 1]]
+    assert at_once(apart.lengths.tolist(), 5) == [[0], [1]]
     together.iterate()
     apart.iterate()
     torch.testing.assert_close(together.qpos, apart.qpos, atol=1e-9, rtol=0)
+
+
+def test_clips_are_taken_as_many_at_once_as_fit() -> None:
+    assert at_once([5, 5, 1, 12, 3, 7], 10) == [[0, 1], [2], [3], [4, 5]]
+    assert at_once([20], 10) == [[0]]
 
 
 def test_stretches_cover_every_step_once() -> None:

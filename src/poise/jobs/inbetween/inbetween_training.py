@@ -3,7 +3,7 @@
 | paper | here |
 |---|---|
 | Harvey et al., section 3: the recurrent transition network | `papers.skeleton2humanoid.rtn` |
-| its windows, split by actor, L2Q, L2P, NPSS | `motion.windows`, `metrics.gap_errors`, `score.gaps` |
+| its windows, split by actor, L2Q, L2P, NPSS | `synthesis.windows`, `metrics.gap_errors`, `score.gaps` |
 | Skeleton2Humanoid, Eqs. 1 to 4: test-time adaptation | `learn.inbetween_model.adapt` |
 | delta to interpolation (Oreshkin et al.), relative times (Qin et al.) | `learn.between` |
 
@@ -41,6 +41,7 @@ from poise.learn.checkpoint import (
     make_generator,
     prefixed,
     save_checkpoint,
+    tensors_of,
 )
 from poise.learn.inbetween_model import (
     MODEL,
@@ -57,7 +58,9 @@ from poise.learn.transition import SkeletonLayout
 from poise.learn.window_sampler import FrameData, Sampler
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import normalize
-from poise.motion.windows import (
+from poise.score.gaps import TestSet, deviation, evaluate, test_set
+from poise.settings import from_data, imported, to_data
+from poise.synthesis.windows import (
     LAFAN1_FACING,
     FrameBank,
     joined,
@@ -66,8 +69,6 @@ from poise.motion.windows import (
     step_contacts,
     without_still_root,
 )
-from poise.score.gaps import TestSet, deviation, evaluate, test_set
-from poise.settings import from_data, imported, to_data
 
 
 def library_bank(
@@ -228,7 +229,7 @@ def frame_data(bank: FrameBank, layout: SkeletonLayout, std: torch.Tensor, rule:
     points = bank.positions()[:, list(bank.feet)]
     parts = cast("tuple[torch.Tensor, ...]", points.split(torch.diff(bank.first).tolist()))
     if rule == "floor":
-        labels = standing_labels(parts, bank.fps)
+        labels = [torch.from_numpy(x) for x in standing_labels([p.numpy() for p in parts], bank.fps)]
     else:
         labels = [step_contacts(part, rule) for part in parts]
     return FrameData(
@@ -337,8 +338,9 @@ def as_model(task: Task, trainer: InbetweenTrainer) -> InbetweenModel:
         "seconds": round(trainer.seconds, 1), "clips": len(task.bank.clips),
     }  # fmt: skip
     bones = task.data.offsets.mean(0)
-    names, shown = task.bank.names, pack_clips([example_of(task.bank)])
-    return InbetweenModel(c.net, net, names, bones, c.fps, c.longest, 10, meta, shown)
+    arrays, notes = pack_clips([example_of(task.bank)])
+    shown = tensors_of(arrays), notes
+    return InbetweenModel(c.net, net, task.bank.names, bones, c.fps, c.longest, 10, meta, shown)
 
 
 def example_of(bank: FrameBank, frames: int = 90) -> Clip:

@@ -36,10 +36,10 @@ from poise.jobs.library.files import (
     motion_files_of,
     subject_of,
 )
-from poise.learn.checkpoint import load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint, tensors_of
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.motion.clip import backwards
-from poise.motion.windows import mirrored_clip
+from poise.motion.mirror import mirrored_clip
 
 #: Grows whenever the same files and settings would give other clips.
 VERSION = 5
@@ -121,8 +121,8 @@ def library_of(
         what = f"none of the {len(files)} clips can be used"
         raise PoiseError(what, hint=report.clips[-1].sentence(), code="no-usable-files")
     if store is not None:
-        tensors, packed = pack_clips(clips)
-        save_checkpoint(store, tensors, {"clips": packed, "report": report.to_dict()})
+        arrays, packed = pack_clips(clips)
+        save_checkpoint(store, tensors_of(arrays), {"clips": packed, "report": report.to_dict()})
     return ClipLibrary.of(clips), report
 
 

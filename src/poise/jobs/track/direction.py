@@ -116,7 +116,8 @@ class Direction:
             out[inside[:, None] & torch.tensor([i in rows for i in range(len(table.rows))])] += price
         for held in (*self.pins, *self.touches):
             span = (held.first, held.last) if isinstance(held, Pin) else (held.frame, held.frame)
-            share = ease(clip.frames, *span, clip.fps)[at.round().long().clamp_max(clip.frames - 1)]
+            share = torch.tensor(ease(clip.frames, *span, clip.fps))
+            share = share[at.round().long().clamp_max(clip.frames - 1)]
             for row in rows_of(table, held.limb):
                 out[:, row] += HELD_PRICE * share.float() ** 4
         return out

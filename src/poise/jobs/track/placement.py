@@ -28,7 +28,7 @@ from poise.kinematics.fit import ClipFit
 from poise.kinematics.forward import Kinematics
 from poise.kinematics.rate import judge_rate
 from poise.kinematics.repair.faults import Fault, read_faults
-from poise.kinematics.retarget.keypoint_goal import KeypointStream, PointBody, StreamConfig
+from poise.kinematics.retargeting.keypoint_goal import KeypointStream, PointBody, StreamConfig
 from poise.metrics import mpjpe_global, mpjpe_root
 from poise.motion import Clip, shifted
 from poise.motion.keypoints import Keypoints

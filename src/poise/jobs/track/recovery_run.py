@@ -162,7 +162,7 @@ def led_along(
         env.reset_to(zero, zero)
         how = tracker.recovery_clips, len(placed) > 1, returns
         goal = Recovering(env.goal.clips, *how)
-        led = _Led(goal, env.reference.coordinates(zero, zero)[0], show)
+        led = LedCharacter(goal, env.reference.coordinates(zero, zero)[0], show)
         losses = (LOSSES + 1) * (len(placed) + led.total / (WITHIN_S * led.rate))
         most = led.total + int(losses * VAIN * AWAY_S * led.rate)
         obs = env.set_goal(goal)
@@ -187,7 +187,7 @@ def led_along(
     return RecoveryRun(whole, out, replayed, losses, led.spans)
 
 
-class _Led:
+class LedCharacter:
     """Observes one character that is led along its motions.
 
     Attributes:
@@ -272,13 +272,13 @@ def one_after_another(
         if end is not None:
             begin = len(of) if begin is None else begin
             share[end : begin + 1] = share[end] + np.linspace(0, 1, begin + 1 - end)[: len(of) - end]
-    turns: dict[int, Tensor] = {}
+    turns: dict[int, np.ndarray] = {}
     for joint in {j for p in placed for j in p.level.turns}:
-        still = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-        each = torch.stack([p.level.turns.get(joint, still) for p in placed])
-        low = torch.tensor(share[at]).long()
-        high = (low + 1).clamp(max=len(placed) - 1)
-        turns[joint] = slerp(each[low], each[high], torch.tensor(share[at]) - low)
+        still = np.array([1.0, 0.0, 0.0, 0.0])
+        each = np.stack([p.level.turns.get(joint, still) for p in placed])
+        low = share[at].astype(int)
+        high = np.minimum(low + 1, len(placed) - 1)
+        turns[joint] = slerp(each[low], each[high], share[at] - low)
     report = FitReport(tuple(fit for p in placed for fit in p.report.clips))
     return replace(first, source=source, level=Levelled(turns), report=report)
 

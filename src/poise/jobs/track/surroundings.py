@@ -42,7 +42,7 @@ def with_supports(
         return (), imitation
     if wanted == "auto":
         r, table = imitation.reference, imitation.humanoid.table
-        found = find_supports(table, r.pose.pos, r.pose.quat, r.rate_hz)
+        found = find_supports(table, r.pose.pos.numpy(), r.pose.quat.numpy(), r.rate_hz)
     else:
         found = on_body(wanted, placed)
     return found, supported(imitation, found) if found else imitation

@@ -9,7 +9,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.body import Anatomy, find_anatomy, generate_table
 from poise.errors import PoiseError
@@ -21,6 +20,7 @@ from poise.kinematics.repair.turns import Flip, out_of_reach, unflip
 from poise.kinematics.travel import Travel, find_travel
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import (
+    forward_kinematics,
     normalize,
     quat_between,
     quat_conj,
@@ -30,7 +30,6 @@ from poise.motion.rotations import (
     rotvec_to_quat,
     unwrap_quats,
 )
-from poise.motion.skeleton import posed
 from poise.motion.smoothing import (
     LINES,
     NOTHING_MM,
@@ -96,8 +95,8 @@ def denoise(clip: Clip) -> Clip:
 
     A long clip is told and smoothed by pieces of `PIECE_S`, which fade into each other.
     """
-    root, rot = np.array(clip.root_pos), unwrap_quats(torch.tensor(clip.rot)).numpy()
-    positions, world = clip.positions(), unwrap_quats(torch.tensor(clip.world()[1])).numpy()
+    root, rot = np.array(clip.root_pos), unwrap_quats(clip.rot)
+    positions, world = clip.positions(), unwrap_quats(clip.world()[1])
     out_root, out_rot, changed = root.copy(), rot.copy(), False
     for here in pieces(clip.frames, clip.fps):
         if (white := white_mm(positions[here], clip.fps)) > NOTHING_MM:
@@ -108,13 +107,13 @@ def denoise(clip: Clip) -> Clip:
         changed = True
         share = faded(here, clip.frames, clip.fps)
         out_root[here] += share[:, None] * (found[0] - root[here])
-        turn = quat_to_rotvec(quat_mul(quat_conj(torch.tensor(rot[here])), torch.tensor(found[1])))
-        step = rotvec_to_quat(torch.tensor(share)[:, None, None] * turn)
-        out_rot[here] = quat_mul(torch.tensor(out_rot[here]), step).numpy()
+        turn = quat_to_rotvec(quat_mul(quat_conj(rot[here]), found[1]))
+        step = rotvec_to_quat(share[:, None, None] * turn)
+        out_rot[here] = quat_mul(out_rot[here], step)
     if not changed:
         return clip
     out_rot /= np.linalg.norm(out_rot, axis=-1, keepdims=True)
-    return clip.replaced(root_pos=out_root, rot=unwrap_quats(torch.tensor(out_rot)).numpy())
+    return clip.replaced(root_pos=out_root, rot=unwrap_quats(out_rot))
 
 
 def _turn(rot: np.ndarray) -> float:
@@ -122,7 +121,7 @@ def _turn(rot: np.ndarray) -> float:
     those that turn."""
     if len(rot) < SHORTEST:
         return 0.0
-    step = quat_distance(torch.tensor(rot[1:]), torch.tensor(rot[:-1])).numpy().mean(0)
+    step = quat_distance(rot[1:], rot[:-1]).mean(0)
     return float(np.median(step[step > STILL_RAD])) if (step > STILL_RAD).any() else 0.0
 
 
@@ -148,7 +147,7 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
         lost = find_lost(clip, rot, noisy=True)
         whole = refill(clip, lost)
         trembles = _trembles(whole)
-    turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
+    turned = np.degrees(quat_distance(whole.rot, clip.rot))
     out = [
         Fault(kind, clip.skeleton.names[j], a, b, float(turned[a : b + 1, j].max()))
         for kind, j, a, b in lost
@@ -161,7 +160,7 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
 
 def _trembles(clip: Clip) -> list[Fault]:
     """The tremble of every piece of a clip without lost joints that has one."""
-    positions, calm = clip.positions(), unwrap_quats(torch.tensor(clip.rot)).numpy()
+    positions, calm = clip.positions(), unwrap_quats(clip.rot)
     groups, out = np.repeat(np.arange(len(clip.skeleton)), 3), list[Fault]()
     for here in pieces(clip.frames, clip.fps):
         first, last, places = here.start, here.stop - 1, positions[here]
@@ -204,18 +203,20 @@ def _piece(
     # Smoothing is for white noise; a motion that a tremble alone shook is still without it.
     if not tones or _white_of(clip, calm_root, calm["own"]) >= WHITE_MM:
         y = smoothed(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
-    out = normalize(torch.tensor(y[:, : 4 * joints].reshape(quats.shape)))
+    out = normalize(y[:, : 4 * joints].reshape(quats.shape))
     if not own:
         local = [out[:, 0]]
         local += [quat_between(out[:, p], out[:, j]) for j, p in enumerate(clip.skeleton.parents) if j]
-        out = torch.stack(local, 1)
-    return y[:, 4 * joints :], out.numpy()
+        out = np.stack(local, 1)
+    return y[:, 4 * joints :], out
 
 
 def _white_of(clip: Clip, root: np.ndarray, rot: np.ndarray) -> float:
     """White noise (mm) of a piece of a clip in another motion, see `white_mm`."""
     unit = rot / np.linalg.norm(rot, axis=-1, keepdims=True)
-    return white_mm(posed(clip.skeleton.parents, clip.skeleton.offsets, root, unit)[0], clip.fps)
+    return white_mm(
+        forward_kinematics(clip.skeleton.parents, clip.skeleton.offsets, root, unit)[0], clip.fps
+    )
 
 
 def find_lost(clip: Clip, rot: np.ndarray, noisy: bool = False) -> list[Lost]:
@@ -269,6 +270,8 @@ def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
         for j in np.flatnonzero(found.any(0))
         for a, b in find_runs(found[:, j], 0)
     ]
+    if not spikes:
+        return spikes
     skeleton = clip.skeleton
     hang = np.eye(len(skeleton), dtype=bool)
     for j in range(len(skeleton) - 1, 0, -1):
@@ -398,10 +401,10 @@ def _repeats(y: np.ndarray) -> bool:
 
 def _turns(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     """`(T, J, 3)` rad, the small turns from the motion below `hz` to `rot (T, J, 4)`, in their axes."""
-    return quat_to_rotvec(quat_mul(quat_conj(_slow(rot, fps, hz)), torch.tensor(rot))).numpy()
+    return quat_to_rotvec(quat_mul(quat_conj(_slow(rot, fps, hz)), rot))
 
 
-def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
+def _slow(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     """`(T, J, 4)` the motion of rotations below a frequency: that of a smoothing spline by its gain,
     turned about its ends. Its bands would need SciPy, for which clean clips need not wait."""
     flat = rot.reshape(len(rot), -1)
@@ -410,7 +413,7 @@ def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
     wave = 2 * np.sin(np.pi * np.arange(len(both) // 2 + 1) / len(both))
     gain = 1.0 / (1.0 + (wave / (2 * np.sin(np.pi * hz / fps))) ** 6)
     slow = line + np.fft.irfft(gain[:, None] * np.fft.rfft(both, axis=0), len(both), axis=0)[: len(rot)]
-    return normalize(torch.tensor(slow.reshape(rot.shape)))
+    return normalize(slow.reshape(rot.shape))
 
 
 def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
@@ -421,7 +424,7 @@ def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     motion and the joint, in the frame in which the tone stands out most.
     """
     frames, joints = rot.shape[:2]
-    base, quat = _slow(rot, fps, hz / 3), torch.tensor(rot)
+    base, quat = _slow(rot, fps, hz / 3), rot
     groups = np.repeat(np.arange(joints), 3)
     ways = (
         (lambda x: quat_mul(quat_conj(base), x), lambda d: quat_mul(base, d)),
@@ -429,12 +432,12 @@ def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     )
     tries = []
     for apart, together in ways:
-        turn = quat_to_rotvec(apart(quat)).reshape(frames, -1).numpy()
+        turn = quat_to_rotvec(apart(quat)).reshape(frames, -1)
         found, clear = tremble_of(turn, groups, Spectrum.of(turn, fps, groups), hz)
-        left = torch.tensor((turn - found).reshape(frames, joints, 3))
+        left = (turn - found).reshape(frames, joints, 3)
         tries.append((clear, together(rotvec_to_quat(left))))
-    own = torch.tensor(tries[0][0] >= tries[1][0])
-    return unwrap_quats(torch.where(own[:, None], tries[0][1], tries[1][1])).numpy()
+    own = tries[0][0] >= tries[1][0]
+    return unwrap_quats(np.where(own[:, None], tries[0][1], tries[1][1]))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
@@ -275,12 +274,12 @@ def limit_faults(clip: Clip) -> list[Fault]:
         if j == 0 or not letters or len(channel.limits) != len(letters):
             continue
         axis = channel.axis or (0.0, 0.0, 0.0)
-        frame = torch.tensor(asf_axis_quat(axis, channel.axis_order, source.up_axis))
+        frame = asf_axis_quat(axis, channel.axis_order, source.up_axis)
         # ASF lists the first-applied turn first, a chain its outermost hinge.
         low, high = np.array(channel.limits[::-1]).T
-        middle = torch.tensor((low + high) / 2)
+        middle = (low + high) / 2
         order = "".join(reversed(letters))
-        angles = chain_angles(torch.tensor(clip.rot[:, j]), order, frame, middle).numpy()
+        angles = chain_angles(clip.rot[:, j], order, frame, middle)
         over = np.degrees(np.maximum(np.maximum(low - angles, angles - high), 0.0)).max(-1)
         found = spell_faults("limit", clip.skeleton.names[j], over, over > BEYOND_DEG, gap)
         out += [f for f in found if f.stop - f.start >= round(LASTING_S * clip.fps)]
@@ -297,7 +296,7 @@ def _rate_faults(support: FloorPoints, clip: Clip) -> list[Fault]:
 
 def _figures(clip: Clip, support: FloorPoints | None) -> dict[str, float | None]:
     """Measures of the whole clip; lengths are told against the floor at z = 0."""
-    pos = torch.tensor(clip.positions())
+    pos = clip.positions()
     shake = jerk(pos, clip.fps)
     step = np.linalg.norm(np.diff(clip.root_pos, axis=0), axis=-1)
     out: dict[str, float | None] = {
@@ -311,16 +310,16 @@ def _figures(clip: Clip, support: FloorPoints | None) -> dict[str, float | None]
         "joint_speed_max_rad_per_s": float(body_steps(clip).max()) * clip.fps,
     }
     if support is not None:
-        lowest = torch.tensor(support.low.min(-1))
+        lowest = support.low.min(-1)
         depth = penetration(lowest)
-        gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com[:, 2]), clip.fps)
+        gap = floating(support.sole_low, support.com[:, 2], clip.fps)
         out["sole_slide_mm_per_s"] = support.sole_slide
         out["penetration_mm"], out["penetration_max_mm"] = _number(depth.mean_mm), _number(depth.max_mm)
         out["float_mm"] = _number(gap)
     return out
 
 
-def _number(value: torch.Tensor) -> float | None:
+def _number(value: np.ndarray) -> float | None:
     return float(value) if math.isfinite(float(value)) else None
 
 

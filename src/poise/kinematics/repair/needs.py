@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kinematics.forward import centre_of_mass, extreme_points, lowest_height, poses_of
@@ -90,7 +89,7 @@ def leaps(clip: Clip, rules: AloneRules | None = None) -> tuple[NotAlone, ...]:
 
 
 def beyond_a_floor(
-    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, rules: AloneRules
+    table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float, rules: AloneRules
 ) -> tuple[NotAlone, ...]:
     """Spells of a motion, standing on z = 0, that need more than a floor; in order of time.
 
@@ -104,8 +103,8 @@ def beyond_a_floor(
     Args:
         pos, quat: `(T, B, 3)` m and `(T, B, 4)` wxyz, places of the body's rows in the world.
     """
-    points = extreme_points(table, pos, quat).numpy()
-    com = centre_of_mass(table, pos, quat).numpy()
+    points = extreme_points(table, pos, quat)
+    com = centre_of_mass(table, pos, quat)
     low = points[..., 2].min(-1)
     flights = find_flights(low, com, fps)
     found = _held(low, flights, fps, rules)
@@ -202,7 +201,7 @@ class Need:
 
 
 def find_needs(
-    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, rules: AloneRules | None = None
+    table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float, rules: AloneRules | None = None
 ) -> tuple[Need, ...]:
     """What a motion needs besides a floor at z = 0, in order of time; spells of one need are joined.
 
@@ -216,7 +215,7 @@ def find_needs(
         table: the body. pos, quat: `(T, B, 3)` m and `(T, B, 4)` wxyz, places of its rows in the world.
     """
     rules = rules or AloneRules()
-    body = _BodyShape(table, pos.double(), quat.double(), fps, rules)
+    body = _BodyShape(table, pos.astype(float), quat.astype(float), fps, rules)
     found: list[Need] = []
     for spell in beyond_a_floor(table, body.pos, body.quat, fps, rules):
         what = body.need(spell)
@@ -234,14 +233,16 @@ def find_needs(
 class _BodyShape:
     """Where the parts of a body are, and what a spell looks like."""
 
-    def __init__(self, table: BodyTable, pos: Tensor, quat: Tensor, fps: float, rules: AloneRules):
+    def __init__(
+        self, table: BodyTable, pos: np.ndarray, quat: np.ndarray, fps: float, rules: AloneRules
+    ):
         self.pos, self.quat, self.table, self.rules = pos, quat, table, rules
-        self.p, self.fps = pos.numpy(), fps
-        self.low = lowest_height(table, pos, quat).numpy()
-        points = extreme_points(table, pos, quat).numpy()
+        self.p, self.fps = pos, fps
+        self.low = lowest_height(table, pos, quat)
+        points = extreme_points(table, pos, quat)
         self.near = points[..., 2] < rules.near_m
         self.points = points[..., :2]
-        com = centre_of_mass(table, pos, quat).numpy()
+        com = centre_of_mass(table, pos, quat)
         self.balance = balance_point(com, fps)[0]
         self.speed = np.linalg.norm(np.gradient(com[:, :2], axis=0), axis=-1) * fps
 

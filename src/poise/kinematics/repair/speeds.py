@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import Anatomy
 from poise.kinematics.repair.faults import Fault, spell_faults
@@ -24,6 +22,7 @@ from poise.motion.rotations import (
     unwrap_quats,
 )
 from poise.motion.smoothing import fade_beside, find_runs, gaussian_sums
+from poise.motion.vectors import norm, running_median
 
 #: rad/s that no human joint reaches. Elbows come nearest to it: 2,300 degrees per second (40 rad/s) in
 #: professional pitchers (Fleisig et al. 1999, J. Biomech. 32). Only their shoulders are faster, about
@@ -77,18 +76,18 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
     held. Where no stretch of `LONGEST_S` does, or where it would lead clearly farther from the file
     (a real turn, only too fast), the joint is smoothed there, as little as it takes.
     """
-    rot = torch.tensor(clip.rot)
+    rot = clip.rot.copy()
     found: list[SpeedRepair] = []
     for j, limit in enumerate(speed_limits(clip, anatomy)):
         track = unwrap_quats(rot[:, j])
         steps = _steps(track) * clip.fps
         if float(steps.max()) <= limit:
             continue
-        for first, last in find_runs(steps.numpy() > limit, round(GAP_S * clip.fps)):
+        for first, last in find_runs(steps > limit, round(GAP_S * clip.fps)):
             # What lies farther away bears no part in a repair, so its time is that of the spell.
             base = max(0, first - _around(clip.fps))
             part = track[base : last + 2 + _around(clip.fps)]
-            old = part.clone()
+            old = part.copy()
             way, (a, b) = _repair(part, first - base, last + 1 - base, limit, clip.fps)
             lo, hi = max(a + 1, 0), min(b - 1, len(part) - 1)
             change = _change(old, part)
@@ -101,7 +100,7 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
                     clip.skeleton.names[j], lo, hi, way, before, after * clip.fps, math.degrees(change)
                 )
             )
-    return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
+    return (clip.replaced(rot=rot), tuple(found)) if found else (clip, ())
 
 
 def without_rougher(
@@ -122,20 +121,20 @@ def without_rougher(
     most = ROUGHER * float(_shake(before).max())
     while True:
         # A third difference is of four frames.
-        rough = torch.nonzero(_shake(after) > most).flatten().tolist()
+        rough = np.flatnonzero(_shake(after) > most).tolist()
         hit = tuple(r for r in repairs if any(r.start - 3 <= k <= r.stop for k in rough))
         if not hit:
             return after, repairs, undone
-        rot = torch.tensor(after.rot)
+        rot = after.rot.copy()
         for r in hit:
             here, j = slice(r.start, r.stop + 1), before.skeleton.index(r.joint)
-            rot[here, j] = torch.tensor(before.rot[here, j])
-        after = after.replaced(rot=rot.numpy())
+            rot[here, j] = before.rot[here, j]
+        after = after.replaced(rot=rot)
         repairs, undone = tuple(r for r in repairs if r not in hit), (*undone, *hit)
 
 
-def _shake(clip: Clip) -> Tensor:
-    return jerk(torch.tensor(clip.positions()), clip.fps)
+def _shake(clip: Clip) -> np.ndarray:
+    return jerk(clip.positions(), clip.fps)
 
 
 def _around(fps: float) -> int:
@@ -145,18 +144,18 @@ def _around(fps: float) -> int:
     return max(2 * reach, round((LONGEST_S + MARGIN_S) * fps) + 2) + 2
 
 
-def _steps(track: Tensor) -> Tensor:
+def _steps(track: np.ndarray) -> np.ndarray:
     """Angles (rad) between neighbouring frames."""
     return quat_angle(quat_between(track[:-1], track[1:]))
 
 
-def _change(old: Tensor, new: Tensor) -> float:
+def _change(old: np.ndarray, new: np.ndarray) -> float:
     return float(quat_angle(quat_between(old, new)).max())
 
 
-def _repair(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[str, tuple[int, int]]:
+def _repair(track: np.ndarray, a: int, b: int, limit: float, fps: float) -> tuple[str, tuple[int, int]]:
     """Repairs frames a to b in place; how, and the unchanged frames on both sides."""
-    old, smooth = track.clone(), track.clone()
+    old, smooth = track.copy(), track.copy()
     stretch = _shortest(track, a, b, limit, fps)
     if stretch is not None:
         _join(track, *stretch)
@@ -177,7 +176,7 @@ def _margin(fps: float) -> int:
     return max(1, round(MARGIN_S * fps)) - 1
 
 
-def _shortest(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[int, int] | None:
+def _shortest(track: np.ndarray, a: int, b: int, limit: float, fps: float) -> tuple[int, int] | None:
     """The kept frames next to the shortest stretch around frames a to b that can be joined.
 
     -1 or `len(track)` where the stretch reaches an end of the clip.
@@ -195,19 +194,19 @@ def _shortest(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[
     return None
 
 
-def _join(track: Tensor, a: int, b: int) -> None:
+def _join(track: np.ndarray, a: int, b: int) -> None:
     """Slerp between frames a and b in place; one of them alone is held to the clip's end."""
     if a < 0:
         track[:b] = track[b]
     elif b >= len(track):
         track[a + 1 :] = track[a]
     else:
-        t = torch.linspace(0.0, 1.0, b - a + 1, dtype=track.dtype)[1:-1]
-        ends = track[a].expand(len(t), 4), track[b].expand(len(t), 4)
+        t = np.linspace(0.0, 1.0, b - a + 1, dtype=track.dtype)[1:-1]
+        ends = np.broadcast_to(track[a], (len(t), 4)), np.broadcast_to(track[b], (len(t), 4))
         track[a + 1 : b] = slerp(*ends, t)
 
 
-def _smooth(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[int, int]:
+def _smooth(track: np.ndarray, a: int, b: int, limit: float, fps: float) -> tuple[int, int]:
     """Blends in the Gaussian mean around frames a to b in place, with the least deviation that does."""
     original, frames, sigma = unwrap_quats(track), len(track), 1.0
     while True:
@@ -234,7 +233,7 @@ JITTER_GAP_S = 0.15
 SIGMAS, JITTER_WIDEST_S = (0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0), 0.05
 
 
-def trembling(path: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
+def trembling(path: np.ndarray, fps: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
     """Noise `(T)` in the unit of `path (T, n)`, and where it exceeds `limit` and is as sharp as noise.
 
     White noise of deviation s has fourth differences of deviation sqrt(70) s, and second ones that are
@@ -245,16 +244,9 @@ def trembling(path: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.nd
     half = max(WINDOW_FRAMES, round(WINDOW_S * fps))
     if frames < 2 * half + 1:
         return np.zeros(frames), np.zeros(frames, dtype=bool)
-    # Takes 0.2 s to load, which `poise info` need not wait for.
-    from scipy.ndimage import median_filter
-
     # A fourth difference is centred on its third frame, a second difference on its second.
     high, low = (
-        median_filter(
-            np.pad(torch.diff(path, n=n, dim=0).norm(dim=-1).numpy(), n // 2, mode="edge"),
-            2 * half + 1,
-            mode="mirror",
-        )
+        running_median(np.pad(norm(np.diff(path, n=n, axis=0)), n // 2, mode="edge"), half)
         for n in (4, 2)
     )
     size = high / math.sqrt(70.0)
@@ -268,9 +260,9 @@ def jitter_faults(clip: Clip) -> list[Fault]:
     """
     gap, least = round(JITTER_GAP_S * clip.fps), WINDOW_FRAMES
     out = []
-    size, bad = trembling(torch.tensor(clip.root_pos), clip.fps, ROOT_M)
+    size, bad = trembling(clip.root_pos, clip.fps, ROOT_M)
     out += spell_faults("root jitter", clip.skeleton.names[0], size * 1e3, bad, gap, least)
-    rot, world = torch.tensor(clip.rot), torch.tensor(clip.world()[1])
+    rot, world = clip.rot.copy(), clip.world()[1]
     for j, bones in enumerate(_bones(clip)):
         for bone in bones:
             size, bad = _bone_noise(world[:, j], bone, clip.fps, BONE_M)
@@ -294,12 +286,12 @@ def mend_jitter(clip: Clip) -> Clip:
     next.
     """
     skeleton = clip.skeleton
-    root = _smoothed(torch.tensor(clip.root_pos), clip.fps, ROOT_M, None)
-    rot, world = torch.tensor(clip.rot), torch.tensor(clip.world()[1])
+    root = _smoothed(clip.root_pos, clip.fps, ROOT_M, None)
+    rot, world = clip.rot.copy(), clip.world()[1]
     smooth = [_smoothed_bones(world[:, j], bones, clip.fps) for j, bones in enumerate(_bones(clip))]
     if root is None and all(s is None for s in smooth):
         return clip
-    out, turned = rot.clone(), world.clone()
+    out, turned = rot.copy(), world.copy()
     for j, parent in enumerate(skeleton.parents):
         above = turned[:, parent] if parent >= 0 else None
         if smooth[j] is None and (above is None or _calmer(rot[:, j], world[:, j])):
@@ -313,47 +305,47 @@ def mend_jitter(clip: Clip) -> Clip:
         if parent >= 0:
             changed |= (turned[:, parent] != world[:, parent]).any(-1)
         out[changed, j] = normalize(local[changed])
-    path = clip.root_pos if root is None else root.numpy()
-    return clip.replaced(root_pos=path, rot=unwrap_quats(out).numpy())
+    path = clip.root_pos if root is None else root
+    return clip.replaced(root_pos=path, rot=unwrap_quats(out))
 
 
-def _bones(clip: Clip) -> list[list[Tensor]]:
+def _bones(clip: Clip) -> list[list[np.ndarray]]:
     """Per joint the vectors (m, its own frame) to its children and tips, the longest first."""
     skeleton = clip.skeleton
-    out: list[list[Tensor]] = [[] for _ in range(len(skeleton))]
+    out: list[list[np.ndarray]] = [[] for _ in range(len(skeleton))]
     for j, parent in enumerate(skeleton.parents):
         if parent >= 0:
-            out[parent].append(torch.tensor(skeleton.offsets[j]))
+            out[parent].append(skeleton.offsets[j])
     for j, tip in skeleton.tips:
-        out[j].append(torch.tensor(tip, dtype=torch.float64))
-    return [
-        sorted((v for v in b if float(v.norm()) > 0.01), key=lambda v: -float(v.norm())) for b in out
-    ]
+        out[j].append(np.asarray(tip, dtype=float))
+    return [sorted((v for v in b if float(norm(v)) > 0.01), key=lambda v: -float(norm(v))) for b in out]
 
 
-def _bone_noise(track: Tensor, bone: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    return trembling(quat_rotate(track, bone.expand(len(track), 3)), fps, limit)
+def _bone_noise(
+    track: np.ndarray, bone: np.ndarray, fps: float, limit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    return trembling(quat_rotate(track, np.broadcast_to(bone, (len(track), 3))), fps, limit)
 
 
-def _calmer(local: Tensor, world: Tensor) -> bool:
+def _calmer(local: np.ndarray, world: np.ndarray) -> bool:
     """Whether a joint trembles less against its parent than in the world."""
     return bool(_shaking(local) <= _shaking(world))
 
 
-def _shaking(track: Tensor) -> Tensor:
+def _shaking(track: np.ndarray) -> np.ndarray:
     steps = quat_to_rotvec(quat_between(track[:-1], track[1:]))
-    return torch.diff(steps, n=3, dim=0).square().mean() if len(steps) > 3 else steps.sum() * 0
+    return np.square(np.diff(steps, n=3, axis=0)).mean() if len(steps) > 3 else steps.sum() * 0
 
 
-def _smoothed_bones(track: Tensor, bones: list[Tensor], fps: float) -> Tensor | None:
+def _smoothed_bones(track: np.ndarray, bones: list[np.ndarray], fps: float) -> np.ndarray | None:
     tries = (_smoothed(unwrap_quats(track), fps, BONE_M, bone) for bone in bones)
     return next((t for t in tries if t is not None), None)
 
 
-def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Tensor | None:
+def _smoothed(path: np.ndarray, fps: float, limit: float, bone: np.ndarray | None) -> np.ndarray | None:
     """The path without its noise, None where it has none; with a `bone`, a path of its rotations."""
 
-    def noise(now: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    def noise(now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return trembling(now, fps, limit) if bone is None else _bone_noise(now, bone, fps, limit)
 
     first = noise(path)
@@ -372,8 +364,8 @@ def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Te
     return out if spells else None
 
 
-def _blend(path: Tensor, start: int, stop: int, sigma: float) -> Tensor:
+def _blend(path: np.ndarray, start: int, stop: int, sigma: float) -> np.ndarray:
     """The Gaussian mean inside the spell, the path itself beyond the filter's reach."""
     total, weights, reach = gaussian_sums(path, sigma)
-    weight = fade_beside(len(path), start, stop, reach + 1).unsqueeze(-1)
+    weight = fade_beside(len(path), start, stop, reach + 1)[..., None]
     return path + weight * (total / weights - path)

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
@@ -49,7 +47,7 @@ class FloorPoints:
     """
 
     fps: float
-    soles: Tensor
+    soles: np.ndarray
     feet: tuple[int, ...]
     low: np.ndarray
     margin: np.ndarray
@@ -64,7 +62,7 @@ class FloorPoints:
     @classmethod
     def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> FloorPoints:
         """The support of a clip with the body `table`, which was made from it."""
-        world = [torch.tensor(x) for x in clip.world()]
+        world = [x for x in clip.world()]
         pos, quat = (x[:, [r.joint for r in table.rows]] for x in world)
         soles = soles_of(table, pos, quat)
         low, margin, names = _low_points(clip, anatomy, *world)
@@ -73,7 +71,7 @@ class FloorPoints:
         labels = np.concatenate([said[j] for j in feet], 1) if feet and set(feet) <= set(said) else None
         return cls(
             clip.fps,
-            torch.cat([sole.ends for sole in soles.values()], 1),
+            np.concatenate([sole.ends for sole in soles.values()], 1),
             tuple(j for j in feet for _ in range(2)),
             low,
             margin,
@@ -117,7 +115,7 @@ class FloorPoints:
         return found if math.isfinite(found) else None
 
     @cached_property
-    def contacts(self) -> tuple[Tensor, Tensor]:
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
         """Horizontal speed (m/s) and contact of every sole point between frames, `(T - 1, F)`.
 
         Contact as the clip's file says it, from frame to frame; else as in `foot_contacts`, within
@@ -126,7 +124,7 @@ class FloorPoints:
         ground = -self.fit.lift_m
         speed, contact = foot_contacts(self.soles, self.fps, height=NEAR_M, ground=ground)
         if self.labels is not None:
-            contact = torch.tensor(self.labels[1:] & self.labels[:-1])
+            contact = self.labels[1:] & self.labels[:-1]
         return speed / 1000.0, contact
 
 
@@ -155,7 +153,7 @@ def sole_slide(clip: Clip) -> float | None:
 
 
 def _low_points(
-    clip: Clip, anatomy: Anatomy, pos: Tensor, quat: Tensor
+    clip: Clip, anatomy: Anatomy, pos: np.ndarray, quat: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Heights of the body's joints and of the tips of its hands, feet and toes; helpers are left out."""
     skeleton = clip.skeleton
@@ -167,7 +165,7 @@ def _low_points(
             columns.append(carried(pos[:, j], quat[:, j], tip)[:, 2])
             margins.append(TIP_M)
             names.append(skeleton.names[j])
-    return torch.stack(columns, -1).numpy(), np.array(margins), tuple(names)
+    return np.stack(columns, -1), np.array(margins), tuple(names)
 
 
 def height_faults(clip: Clip, support: FloorPoints) -> list[Fault]:
@@ -213,8 +211,8 @@ def foot_slips(support: FloorPoints) -> list[tuple[int, np.ndarray, np.ndarray]]
 
     The sole of a rolling foot has one point that rests; where none is in contact the velocity is zero.
     """
-    speed, contact = (x.numpy() for x in support.contacts)
-    velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
+    speed, contact = (x for x in support.contacts)
+    velocity = np.diff(support.soles[..., :2], axis=0) * support.fps
     out = []
     for foot in dict.fromkeys(support.feet):
         mine = np.flatnonzero(np.array(support.feet) == foot)
@@ -240,8 +238,8 @@ def drifts(support: FloorPoints) -> bool:
     trembles does not. From the slips of either foot those of the other must follow, so that at least
     `EXPLAINED` of their energy goes.
     """
-    contact = support.contacts[1].numpy()
-    velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
+    contact = support.contacts[1]
+    velocity = np.diff(support.soles[..., :2], axis=0) * support.fps
     told = []
     for foot in dict.fromkeys(support.feet):
         mine = np.flatnonzero(np.array(support.feet) == foot)
@@ -297,13 +295,13 @@ def stance(support: FloorPoints) -> tuple[np.ndarray, float, float]:
     and a chain of two states joins the frames. The s are those of the frames that stand, told again with
     them: the more noise is left, the faster and the higher may an end be that stands.
     """
-    soles, fps = support.soles.numpy(), support.fps
+    soles, fps = support.soles, support.fps
     velocity = np.diff(soles, axis=0) * fps
     height = np.maximum(soles[1:, :, 2], soles[:-1, :, 2]) + support.fit.lift_m
-    stands, level, rise = support.contacts[1].numpy().astype(float), 0.0, 0.0
+    stands, level, rise = support.contacts[1].astype(float), 0.0, 0.0
     if support.labels is None:
         # Where all that is near the floor is fast, a foot swings through; skating is no tremble.
-        stands *= support.contacts[0].numpy() <= SWING[0]
+        stands *= support.contacts[0] <= SWING[0]
     for _ in range(TOLD_ROUNDS):
         total = stands.sum()
         if total < 1.0:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from poise.formats.guess import root_jumps
 from poise.kinematics.feet import SAME_FLOOR_M
@@ -37,8 +36,8 @@ class Hold(NamedTuple):
 
 def body_steps(clip: Clip) -> np.ndarray:
     """`(T - 1, J)` rad, how far every joint turns from frame to frame."""
-    rot = torch.tensor(clip.rot)
-    return quat_distance(rot[:-1], rot[1:]).numpy()
+    rot = clip.rot.copy()
+    return quat_distance(rot[:-1], rot[1:])
 
 
 def find_holds(clip: Clip) -> list[Hold]:
@@ -106,19 +105,18 @@ def timing_faults(clip: Clip) -> list[Fault]:
 def mend_holds(clip: Clip) -> Clip:
     """Repeated frames filled in by interpolation, or left out where they were put in between."""
     holds = find_holds(clip)
-    root, rot = np.array(clip.root_pos), torch.tensor(clip.rot)
+    root, rot = clip.arrays()
     keep = np.ones(clip.frames, dtype=bool)
     for hold in holds:
         if not hold.filled:
             keep[hold.start : hold.stop + 1] = False
             continue
         a, b = hold.start - 1, hold.stop + 1
-        t = torch.linspace(0.0, 1.0, b - a + 1, dtype=rot.dtype)[1:-1]
-        first, last = (rot[k].expand(len(t), *rot[k].shape) for k in (a, b))
-        rot[a + 1 : b] = slerp(first, last, t[:, None].expand(-1, rot.shape[1]))
-        share = t.numpy()[:, None]
+        t = np.linspace(0.0, 1.0, b - a + 1, dtype=rot.dtype)[1:-1]
+        rot[a + 1 : b] = slerp(rot[a], rot[b], t[:, None])
+        share = t[:, None]
         root[a + 1 : b] = root[a] * (1 - share) + root[b] * share
-    return clip.replaced(root_pos=root[keep], rot=rot.numpy()[keep]) if holds else clip
+    return clip.replaced(root_pos=root[keep], rot=rot[keep]) if holds else clip
 
 
 def mend_teleports(clip: Clip, low: np.ndarray | None = None) -> Clip:

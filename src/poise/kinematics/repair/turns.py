@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import Anatomy
 from poise.motion import Clip, Skeleton
@@ -23,6 +21,7 @@ from poise.motion.rotations import (
     rotvec_to_quat,
 )
 from poise.motion.smoothing import find_runs
+from poise.motion.vectors import cross, lower_median, norm
 
 #: Angles (rad) from the neutral pose that no foot or hand reaches. A foot: 50 degrees of plantar flexion
 #: (American Academy of Orthopaedic Surgeons) and about twice that in a ballet dancer on pointe, to which
@@ -60,7 +59,7 @@ def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip
     since mirrored solutions of a solver lie there, or the axis of the jump itself where that is a
     single step and leads nearer to neutral.
     """
-    rot = torch.tensor(clip.rot)
+    rot = clip.rot.copy()
     neutral, stands = neutral_pose(clip, anatomy)
     found: list[Flip] = []
     for part in anatomy.parts:
@@ -69,9 +68,9 @@ def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip
             continue
         j, home = part.joint, neutral[part.joint]
         away = _from(home, rot[:, j])
-        for start, stop in find_runs(away.numpy() > limit, round(GAP_S * clip.fps)):
+        for start, stop in find_runs(away > limit, round(GAP_S * clip.fps)):
             whole = start == 0 and stop == clip.frames - 1
-            if whole and not (stands and float(away.median()) > HALF_TURN):
+            if whole and not (stands and float(lower_median(away)) > HALF_TURN):
                 continue
             if not whole and not _jumps(rot[:, j], start, stop, speed / clip.fps, clip.fps):
                 continue
@@ -81,11 +80,15 @@ def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip
                 continue
             spell = slice(start, stop + 1)
             fixed = normalize(quat_mul(rot[spell, j], back))
-            turned, before, after = quat_angle(back), away[spell].median(), _from(home, fixed).median()
+            turned, before, after = (
+                quat_angle(back),
+                lower_median(away[spell]),
+                lower_median(_from(home, fixed)),
+            )
             rot[spell, j] = fixed
             numbers = [math.degrees(float(x)) for x in (turned, before, after)]
             found.append(Flip(clip.skeleton.names[j], start, stop, *numbers))
-    return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
+    return (clip.replaced(rot=rot), tuple(found)) if found else (clip, ())
 
 
 def out_of_reach(clip: Clip, anatomy: Anatomy) -> tuple[tuple[str, int], ...]:
@@ -94,13 +97,13 @@ def out_of_reach(clip: Clip, anatomy: Anatomy) -> tuple[tuple[str, int], ...]:
     out = []
     for part in anatomy.parts:
         if part.kind in UNREACHABLE:
-            away = _from(neutral[part.joint], torch.tensor(clip.rot[:, part.joint]))
+            away = _from(neutral[part.joint], clip.rot[:, part.joint])
             frames = int((away > UNREACHABLE[part.kind]).sum())
             out += [(clip.skeleton.names[part.joint], frames)] if frames else []
     return tuple(out)
 
 
-def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
+def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[np.ndarray, bool]:
     """`(J, 4)` wxyz local rotations from which reach is measured, and whether they are the rest pose.
 
     Identity where the rest pose stands: its ankles lie below the hips by nearly the length of the
@@ -108,7 +111,7 @@ def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
     """
     skeleton = clip.skeleton
     rest = skeleton.rest_positions()
-    identity = torch.zeros(len(skeleton), 4, dtype=torch.float64)
+    identity = np.zeros((len(skeleton), 4))
     identity[:, 0] = 1.0
     drops = []
     for thigh, shin, foot in zip(*(anatomy.of(k) for k in ("thigh", "shin", "foot")), strict=True):
@@ -116,17 +119,17 @@ def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
         drops.append((rest[thigh, 2] - rest[foot, 2]) / max(float(leg), 1e-9))
     if drops and min(drops) > 0.9:
         return identity, True
-    rot = torch.tensor(clip.rot)
+    rot = clip.rot.copy()
     # The principal eigenvector of the sum of q q^T (Markley et al. 2007).
-    mean = torch.linalg.eigh(torch.einsum("tja,tjb->jab", rot, rot)).eigenvectors[..., -1]
+    mean = np.linalg.eigh(np.einsum("tja,tjb->jab", rot, rot)).eigenvectors[..., -1]
     return mean, False
 
 
-def _from(home: Tensor, rot: Tensor) -> Tensor:
+def _from(home: np.ndarray, rot: np.ndarray) -> np.ndarray:
     return quat_angle(quat_between(home, rot))
 
 
-def _jumps(rot: Tensor, start: int, stop: int, step: float, fps: float) -> bool:
+def _jumps(rot: np.ndarray, start: int, stop: int, step: float, fps: float) -> bool:
     """Whether some step near either end of the spell is larger than `step` rad."""
     steps = quat_angle(quat_between(rot[:-1], rot[1:]))
     reach = max(1, round(REACH_S * fps))
@@ -136,34 +139,34 @@ def _jumps(rot: Tensor, start: int, stop: int, step: float, fps: float) -> bool:
     return any(bool((e > step).any()) for e in ends)
 
 
-def _own_axes(skeleton: Skeleton, joint: int) -> Tensor:
+def _own_axes(skeleton: Skeleton, joint: int) -> np.ndarray:
     """`(3, 3)` unit rows in the joint's frame: along its bone, and two across it."""
     tips = [skeleton.offsets[c] for c in skeleton.children(joint)]
     tips += [np.array(v) for j, v in skeleton.ends if j == joint]
     tips = [v for v in tips if np.linalg.norm(v) > 1e-3] or [np.array([1.0, 0.0, 0.0])]
-    along = torch.tensor(max(tips, key=lambda v: float(np.linalg.norm(v))))
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    if torch.linalg.cross(along, up).norm() < 0.1 * along.norm():
-        up = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    across = torch.linalg.cross(up, along)
-    return normalize(torch.stack((along, across, torch.linalg.cross(along, across))))
+    along = max(tips, key=lambda v: float(np.linalg.norm(v)))
+    up = np.array([0.0, 0.0, 1.0], dtype=float)
+    if norm(cross(along, up)) < 0.1 * norm(along):
+        up = np.array([1.0, 0.0, 0.0], dtype=float)
+    across = cross(up, along)
+    return normalize(np.stack((along, across, cross(along, across))))
 
 
 def _turn_back(
-    rot: Tensor, start: int, stop: int, home: Tensor, axes: Tensor, step: float
-) -> Tensor | None:
+    rot: np.ndarray, start: int, stop: int, home: np.ndarray, axes: np.ndarray, step: float
+) -> np.ndarray | None:
     """The turn (wxyz, joint's frame) that brings the spell nearest to neutral, if any brings it home."""
     turns = list(rotvec_to_quat(axes * math.pi))
     own = _jump_turn(rot, start, stop, step)
     if own is not None:
         turns.append(own)
     spell = rot[start : stop + 1]
-    rest = [float(_from(home, quat_mul(spell, t)).median()) for t in turns]
+    rest = [float(lower_median(_from(home, quat_mul(spell, t)))) for t in turns]
     best = int(np.argmin(rest))
     return turns[best] if rest[best] < HOME else None
 
 
-def _jump_turn(rot: Tensor, start: int, stop: int, step: float) -> Tensor | None:
+def _jump_turn(rot: np.ndarray, start: int, stop: int, step: float) -> np.ndarray | None:
     """The turn that undoes the jumps at the ends of a spell, where they are one clean step each."""
     turns = []
     for inner, outer, way in ((start, start - 1, -1), (stop, stop + 1, 1)):
@@ -286,8 +289,8 @@ def _forwards(
 
 def _world(quat: np.ndarray, tip: tuple[float, float, float]) -> np.ndarray:
     """`(S, 3)` m, a joint's own vector `tip` in the world."""
-    turns = torch.tensor(quat)
-    return quat_rotate(turns, torch.tensor(tip, dtype=turns.dtype).expand(len(turns), 3)).numpy()
+    turns = quat
+    return quat_rotate(turns, np.broadcast_to(tip, (len(turns), 3)))
 
 
 def _across(v: np.ndarray, up: np.ndarray) -> np.ndarray:

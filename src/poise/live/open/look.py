@@ -102,7 +102,7 @@ def judged(clip: Clip) -> dict[str, Any]:
     support = support_of(clip, anatomy_of(clip))
     contacts: list[dict[str, Any]] = []
     if support is not None:
-        touching = support.contacts[1].numpy()
+        touching = support.contacts[1]
         for foot in dict.fromkeys(support.feet):
             mine = np.any(touching[:, np.array(support.feet) == foot], axis=-1)
             contacts.append({"joint": foot, "runs": [[a, b + 1] for a, b in find_runs(mine, 1)]})

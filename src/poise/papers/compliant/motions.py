@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.env import Reference
 from poise.errors import PoiseError
@@ -46,8 +44,8 @@ def at_ease(tracker: Tracker, yaw: float = 0.0) -> np.ndarray:
     hips = _hips(tracker, clip)
     side = hips if hips is not None else left - right
     turn = yaw + np.pi / 2 - np.arctan2(side[1], side[0])
-    about = torch.tensor([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)], dtype=torch.float64)
-    qpos[3:7] = quat_mul(about, torch.from_numpy(qpos[3:7])).numpy()
+    about = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)], dtype=float)
+    qpos[3:7] = quat_mul(about, qpos[3:7])
     qpos[:2] = 0.0
     return qpos
 
@@ -127,14 +125,14 @@ def _hopping(
     hanging = feet[left] + lift * (lifted + 0.6 * over) + along
     hanging[:, 2] += height
     clip = still.replaced(root_pos=still.root_pos + moved)
-    root, rot = clip.tensors()
-    goals: dict[int | str, Tensor] = {right: torch.from_numpy(standing), left: torch.from_numpy(hanging)}
-    bent = clip.replaced(rot=match_positions(clip.skeleton, rot, root, goals).numpy())
+    root, rot = clip.arrays()
+    goals: dict[int | str, np.ndarray] = {right: standing, left: hanging}
+    bent = clip.replaced(rot=match_positions(clip.skeleton, rot, root, goals))
     # The sole stays level.
-    world, level = torch.from_numpy(bent.world()[1]), torch.from_numpy(still.world()[1])
-    rot = bent.tensors()[1].clone()
+    world, level = bent.world()[1], still.world()[1]
+    rot = bent.rot.copy()
     rot[:, right] = quat_mul(quat_conj(world[:, clip.skeleton.parents[right]]), level[:, right])
-    return bent.replaced(rot=rot.numpy())
+    return bent.replaced(rot=rot)
 
 
 def hops(t: np.ndarray, ways: Ways = WAYS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -191,7 +189,7 @@ def opening(tracker: Tracker, width: float = 1.0) -> Clip:
     return _led(clip, _hand_path(clip, knob, t))
 
 
-def _hand_path(clip: Clip, knob: np.ndarray, t: np.ndarray) -> Tensor:
+def _hand_path(clip: Clip, knob: np.ndarray, t: np.ndarray) -> np.ndarray:
     """`(T, 3)` where the left hand goes: hanging, to the knob, along with it, back."""
     hand = clip.positions()[:, end_of(clip.skeleton, "left_hand")]
     shoulder = clip.positions()[0, clip.skeleton.parents[_elbow(clip)]]
@@ -199,17 +197,17 @@ def _hand_path(clip: Clip, knob: np.ndarray, t: np.ndarray) -> Tensor:
     share = smooth_step(t, 0.4, door.GRIPS_S - 0.2) - smooth_step(
         t, door.LETS_GO_S + 0.05, door.LASTS_S - 0.1
     )
-    return torch.from_numpy(hand + share[:, None] * (there - hand))
+    return hand + share[:, None] * (there - hand)
 
 
 def _elbow(clip: Clip) -> int:
     return clip.skeleton.parents[end_of(clip.skeleton, "left_hand")]
 
 
-def _led(clip: Clip, goal: Tensor) -> Clip:
-    root, rot = clip.tensors()
+def _led(clip: Clip, goal: np.ndarray) -> Clip:
+    root, rot = clip.arrays()
     led = match_positions(clip.skeleton, rot, root, {end_of(clip.skeleton, "left_hand"): goal})
-    return clip.replaced(rot=led.numpy())
+    return clip.replaced(rot=led)
 
 
 def standing(tracker: Tracker, seconds: float) -> Imitation:

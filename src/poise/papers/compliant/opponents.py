@@ -262,7 +262,7 @@ class Shifted(Event):
     def __init__(self, goal: Goal, backend: Backend):
         table, n, here = goal.humanoid.table, backend.num_envs, backend.device
         self._backend, self._rate = backend, goal.rate_hz
-        self._kinematics = Kinematics(table, torch.float32, here)
+        self._kinematics = Kinematics(table, "float32")
         nothing = torch.zeros(n, goal.humanoid.model.nv, dtype=torch.float64, device=here)
         self._u = goal.offset if isinstance(goal, DisplacedGoal) else nothing
         self.before = torch.zeros(n, len(table.rows), 3, device=here)

@@ -164,6 +164,18 @@ class Segments:
     last: np.ndarray
 
 
+def at_once(lengths: Sequence[int], most: int) -> list[list[int]]:
+    """Clips of so many frames in order, cut into parts of at most `most` frames each, or of one clip."""
+    parts, held = [list[int]()], 0
+    for clip, length in enumerate(lengths):
+        if parts[-1] and held + length > most:
+            parts.append([])
+            held = 0
+        parts[-1].append(clip)
+        held += length
+    return parts
+
+
 def segments(lengths: np.ndarray, size: int, shift: int) -> np.ndarray:
     """`(S, 2)` first row and end of segments of about `size` steps; the first of a motion has `shift`
     of them.
@@ -334,7 +346,7 @@ class TrajectoryOptimizer:
     def iterate(self) -> TrajOptStats:
         """One iteration over all clips."""
         begun = time.perf_counter()
-        for clips in self._parts():
+        for clips in at_once(self.lengths.tolist(), ROWS):
             self._improve(clips)
         self.iteration += 1
         self.seconds += time.perf_counter() - begun
@@ -347,7 +359,7 @@ class TrajectoryOptimizer:
         """The trajectories as they are now, with feedback that uses no wrench."""
         frames, n = self.reference.frames, 2 * self.model.nv
         feedback = torch.zeros(frames, self.joints, n)
-        for clips in self._parts():
+        for clips in at_once(self.lengths.tolist(), ROWS):
             rows = self._rows(clips)
             gains = self._regulate(rows, self.lengths[clips], self.config.sizes[1], helped=False)
             feedback[rows] = torch.from_numpy(gains.feedback)
@@ -391,15 +403,6 @@ class TrajectoryOptimizer:
         """Compute differences; their number is that of a few frames, or of all that there are."""
         each = 2 * (2 * self.model.nv + self.action.shape[1]) + 1
         return CpuBackend(self.model, max(each, min(WORLDS, each * len(self.qpos))), self.threads)
-
-    def _parts(self) -> list[list[int]]:
-        """Clips, some at a time, so that their linear models fit into memory."""
-        parts: list[list[int]] = [[]]
-        for clip, length in enumerate(self.lengths.tolist()):
-            if parts[-1] and sum(self.lengths[parts[-1]]) + length > ROWS:
-                parts.append([])
-            parts[-1].append(clip)
-        return parts
 
     def _rows(self, clips: Sequence[int]) -> Tensor:
         spans = [np.arange(self.starts[c], self.starts[c] + self.lengths[c]) for c in clips]

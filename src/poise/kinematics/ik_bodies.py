@@ -6,29 +6,27 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyTable, Humanoid, find_anatomy
 from poise.kinematics.coords import best_path, wrapped
 from poise.kinematics.forward import Kinematics
 from poise.motion import Skeleton
 from poise.motion.rotations import across, normalize, quat_to_matrix, rejected, shortest_arc
+from poise.motion.vectors import cross, norm
 
 
-def square_to(a: Tensor, b: Tensor) -> Tensor:
+def square_to(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The part of `a (..., 3)` square to unit `b`; some vector across b where nothing remains."""
     rest = rejected(a, b)
-    lost = rest.norm(dim=-1, keepdim=True) < 1e-9 * (a.norm(dim=-1, keepdim=True) + 1e-300)
-    return torch.where(lost, across(b), rest)
+    lost = norm(rest, keepdims=True) < 1e-9 * (norm(a, keepdims=True) + 1e-300)
+    return np.where(lost, across(b), rest)
 
 
 def frame_of(
-    hold: str, x: Tensor | None = None, y: Tensor | None = None, z: Tensor | None = None
-) -> Tensor:
+    hold: str, x: np.ndarray | None = None, y: np.ndarray | None = None, z: np.ndarray | None = None
+) -> np.ndarray:
     """Orthonormal `(..., 3, 3)` of two directions; axis `hold` is kept, the other made square to it."""
     given = {"x": x, "y": y, "z": z}
     kept = given.pop(hold)
@@ -39,43 +37,43 @@ def frame_of(
     # The third axis closes the cycle x, y, z.
     last = next(k for k in "xyz" if k not in axes)
     at = "xyz".index(last)
-    axes[last] = torch.linalg.cross(axes["xyz"[(at + 1) % 3]], axes["xyz"[(at + 2) % 3]])
-    return torch.stack((axes["x"], axes["y"], axes["z"]), -1)
+    axes[last] = cross(axes["xyz"[(at + 1) % 3]], axes["xyz"[(at + 2) % 3]])
+    return np.stack((axes["x"], axes["y"], axes["z"]), -1)
 
 
-def rotate(m: Tensor, v: Tensor) -> Tensor:
+def rotate(m: np.ndarray, v: np.ndarray) -> np.ndarray:
     """m v `(..., 3)`."""
-    return (m @ v.unsqueeze(-1)).squeeze(-1)
+    return (m @ v[..., None])[..., 0]
 
 
-def arc(a: Tensor, b: Tensor) -> Tensor:
+def arc(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Matrices `(..., 3, 3)` of the smallest turn that brings `a (..., 3)` onto `b`."""
     return quat_to_matrix(shortest_arc(a, b))
 
 
-def prefix_product(m: Tensor) -> Tensor:
+def prefix_product(m: np.ndarray) -> np.ndarray:
     """m_t ... m_1 m_0 for every t `(T, ..., 3, 3)` in log2(T) passes (Hillis and Steele 1986)."""
-    out, reach = m.clone(), 1
+    out, reach = m.copy(), 1
     while reach < len(out):
-        out = torch.cat((out[:reach], out[reach:] @ out[:-reach]))
+        out = np.concatenate((out[:reach], out[reach:] @ out[:-reach]))
         reach *= 2
     return out
 
 
-def bend_normals(upper: Tensor, lower: Tensor) -> Tensor:
+def bend_normals(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
     """u x v made unit length: Eqs. 5, 10 and 13 (up to sign), undefined for a straight limb."""
-    return normalize(torch.linalg.cross(upper, lower))
+    return normalize(cross(upper, lower))
 
 
 def held_normals(
-    upper: Tensor,
-    lower: Tensor,
-    parent: Tensor,
-    rest_upper: Tensor,
-    rest_normal: Tensor,
+    upper: np.ndarray,
+    lower: np.ndarray,
+    parent: np.ndarray,
+    rest_upper: np.ndarray,
+    rest_normal: np.ndarray,
     straight: float,
     reach: float,
-) -> Tensor:
+) -> np.ndarray:
     """Unit bend axes `(T, L, 3)`, world, that never jump where a limb is straight.
 
     The angle theta of the observed axis about the upper bone is stated against an axis that is carried
@@ -94,36 +92,36 @@ def held_normals(
     into = parent.mT
     u, v = rotate(into, upper), rotate(into, lower)
     carried = _carried(u, rest_normal)
-    other, normal = torch.linalg.cross(u, carried), torch.linalg.cross(u, v)
-    sine = normal.norm(dim=-1).numpy()
+    other, normal = cross(u, carried), cross(u, v)
+    sine = norm(normal)
 
-    def angle(n: Tensor) -> np.ndarray:
-        return torch.atan2((n * other).sum(-1), (n * carried).sum(-1)).numpy()
+    def angle(n: np.ndarray) -> np.ndarray:
+        return np.arctan2((n * other).sum(-1), (n * carried).sum(-1))
 
     theta = angle(normal)
     weight = sine**4 / (sine**4 + np.sin(straight) ** 4)
     # The way of least turning from the rest pose; it is lost where the bone points the other way.
-    home = rotate(arc(rest_upper.expand_as(u), u), rest_normal.expand_as(u))
-    trust = ((0.5 + 0.5 * (rest_upper * u).sum(-1)) ** 2).numpy()
+    home = rotate(arc(np.broadcast_to(rest_upper, u.shape), u), np.broadcast_to(rest_normal, u.shape))
+    trust = (0.5 + 0.5 * (rest_upper * u).sum(-1)) ** 2
     line = 0.5 * np.angle(_mean(theta, weight, angle(home), 1e-4 * trust, reach))
     both = np.stack((line, line + np.pi), -1)  # (T, L, 2)
     # The bend about each of the two axes: negative is to the wrong side.
-    bend = np.arctan2(sine, (u * v).sum(-1).numpy())[..., None] * np.cos(theta[..., None] - both)
+    bend = np.arctan2(sine, (u * v).sum(-1))[..., None] * np.cos(theta[..., None] - both)
     step = wrapped(both[1:, :, None, :] - both[:-1, :, :, None])
     astray = wrapped(both - angle(home)[..., None])
     pull = np.square(np.minimum(bend, 0.0)) + 1e-4 * trust[..., None] * astray**2
     pick = best_path(step**2, pull)
-    turn = torch.tensor(np.take_along_axis(both, pick[..., None], -1))
-    return rotate(parent, turn.cos() * carried + turn.sin() * other)
+    turn = np.take_along_axis(both, pick[..., None], -1)
+    return rotate(parent, np.cos(turn) * carried + np.sin(turn) * other)
 
 
-def _carried(u: Tensor, start: Tensor) -> Tensor:
+def _carried(u: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Unit vectors `(T, L, 3)` square to `u (T, L, 3)` that never turn about it from frame to frame."""
-    none = torch.eye(3, dtype=u.dtype).expand(1, *u.shape[1:], 3)
+    none = np.broadcast_to(np.eye(3, dtype=u.dtype), (1, *u.shape[1:], 3))
     begin = square_to(start, u[0])
-    begin = torch.where(begin.norm(dim=-1, keepdim=True) < 0.05, across(u[0]), normalize(begin))
-    turns = prefix_product(torch.cat((none, arc(u[:-1], u[1:]))))
-    return normalize(square_to(rotate(turns, begin.expand_as(u)), u))
+    begin = np.where(norm(begin, keepdims=True) < 0.05, across(u[0]), normalize(begin))
+    turns = prefix_product(np.concatenate((none, arc(u[:-1], u[1:]))))
+    return normalize(square_to(rotate(turns, np.broadcast_to(begin, u.shape)), u))
 
 
 def _mean(
@@ -183,13 +181,13 @@ class IkBody:
     arms: tuple[Arm, ...]
     toes: Mapping[int, int]
     heads: Mapping[int, int]
-    rest_pos: Tensor
-    rest_rot: Tensor
-    links: Tensor
-    axes: Tensor
+    rest_pos: np.ndarray
+    rest_rot: np.ndarray
+    links: np.ndarray
+    axes: np.ndarray
     clusters: Mapping[int, tuple[int, ...]]
-    normals: Tensor
-    trunk: Tensor
+    normals: np.ndarray
+    trunk: np.ndarray
 
     @property
     def chest(self) -> int:
@@ -205,7 +203,7 @@ class IkBody:
 def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
     """See `IkBody`; `skeleton` tells where the toes are."""
     rows = table.rows
-    zero = torch.zeros(1, 7 + sum(len(r.order) for r in rows), dtype=torch.float64)
+    zero = np.zeros((1, 7 + sum(len(r.order) for r in rows)))
     zero[:, 3] = 1.0
     rest = Kinematics(table)(zero)
     rest_rot = quat_to_matrix(rest.quat[0])
@@ -218,8 +216,8 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
         if foot is not None and np.linalg.norm(skeleton.offsets[joint]) > 1e-4:
             toes[foot] = len(points)
             points.append(skeleton.names[joint])
-            places.append(places[foot] + rest_rot[foot] @ torch.tensor(skeleton.offsets[joint]))
-    rest_pos = torch.stack(places)
+            places.append(places[foot] + rest_rot[foot] @ skeleton.offsets[joint])
+    rest_pos = np.stack(places)
     spine = tuple(i for i, r in enumerate(rows) if r.kind == "spine")
     roles = _roles(table, spine, toes)
     children: dict[int, list[int]] = {}
@@ -238,8 +236,8 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
     heads = {i: children[i][0] for i, r in enumerate(rows) if r.kind == "neck" and i in children}
     trunk = _trunk(rest_pos, roles)
     arms = _arms(table)
-    axes = quat_to_matrix(torch.tensor([r.frame for r in rows], dtype=torch.float64))
-    normals = torch.stack([_normal(table, a, rest_pos, rest_rot, axes, trunk) for a in arms])
+    axes = quat_to_matrix(np.array([r.frame for r in rows], dtype=float))
+    normals = np.stack([_normal(table, a, rest_pos, rest_rot, axes, trunk) for a in arms])
     return IkBody(
         table=table,
         points=tuple(points),
@@ -250,7 +248,7 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
         heads=heads,
         rest_pos=rest_pos,
         rest_rot=rest_rot,
-        links=quat_to_matrix(torch.tensor([r.quat for r in rows], dtype=torch.float64)),
+        links=quat_to_matrix(np.array([r.quat for r in rows], dtype=float)),
         axes=axes,
         clusters={i: (i, *attached(i)) for i in (0, *spine[-1:])},
         normals=normals,
@@ -294,7 +292,7 @@ def _arms(table: BodyTable) -> tuple[Arm, ...]:
     )
 
 
-def _trunk(rest: Tensor, roles: Mapping[str, int]) -> Tensor:
+def _trunk(rest: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
     """Columns left, up and forward of a body at rest, from its hips and shoulders."""
     hips = rest[roles["lhip"]] + rest[roles["rhip"]]
     up = rest[roles["ls"]] + rest[roles["rs"]] - hips
@@ -302,8 +300,8 @@ def _trunk(rest: Tensor, roles: Mapping[str, int]) -> Tensor:
 
 
 def _normal(
-    table: BodyTable, arm: Arm, rest: Tensor, rot: Tensor, axes: Tensor, trunk: Tensor
-) -> Tensor:
+    table: BodyTable, arm: Arm, rest: np.ndarray, rot: np.ndarray, axes: np.ndarray, trunk: np.ndarray
+) -> np.ndarray:
     """The axis about which an elbow or knee bends, in the rest pose.
 
     The hinge itself where there is one alone; else what the rest pose shows; where it is straight, that
@@ -313,10 +311,10 @@ def _normal(
     lower = normalize(rest[arm.end] - rest[arm.lower])
     up, forward = trunk[:, 1], trunk[:, 2]
     towards = -forward if arm.leg else forward
-    usual = torch.cross(upper, towards, dim=-1)
-    if float(cast("Tensor", usual.norm())) < 0.3:
+    usual = cross(upper, towards)
+    if float(norm(usual)) < 0.3:
         # The bone points that way itself: a seated thigh bends down, an arm held forward bends up.
-        usual = torch.cross(upper, -up if arm.leg else up, dim=-1)
+        usual = cross(upper, -up if arm.leg else up)
     usual = normalize(usual)
     row = table.rows[arm.lower]
     if len(row.order) == 1:
@@ -327,8 +325,8 @@ def _normal(
         towards_one_side = abs(low + high) > 0.5 * (high - low)
         sign = math.copysign(1.0, low + high if towards_one_side else along)
         return normalize(square_to(sign * axis, upper))
-    bend = torch.cross(upper, lower, dim=-1)
-    angle = math.atan2(float(cast("Tensor", bend.norm())), float(upper @ lower))
+    bend = cross(upper, lower)
+    angle = math.atan2(float(norm(bend)), float(upper @ lower))
     if angle > REST_BEND:
         return normalize(bend)
     if len(row.order) == 3:
@@ -336,5 +334,5 @@ def _normal(
         if abs(float(middle @ usual)) > 0.7 and abs(float(first @ upper)) < 0.3:
             # A middle hinge would lock at 90 degrees. The first one bends the limb down, which in a
             # T-pose is what Eqs. 10 and 13 say.
-            usual = first if float(first @ torch.cross(upper, -up, dim=-1)) >= 0 else -first
+            usual = first if float(first @ cross(upper, -up)) >= 0 else -first
     return normalize(square_to(usual, upper))

@@ -10,15 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from poise.body.topology import subtree
-from poise.kinematics.retarget.common_pose import common_pose
-from poise.kinematics.retarget.passage import Retargeter
-from poise.kinematics.retarget.plant import feet_of, plant, source_contacts
-from poise.kinematics.retarget.retarget_report import RetargetReport, measure
-from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.retargeting.common_pose import common_pose
+from poise.kinematics.retargeting.passage import Retargeter
+from poise.kinematics.retargeting.plant import feet_of, plant, source_contacts
+from poise.kinematics.retargeting.retarget_report import RetargetReport, measure
+from poise.kinematics.retargeting.standing import ClipWorld
 from poise.motion import Clip, Roles, Skeleton
 from poise.motion.roles import SIDES, find_roles
 from poise.motion.rotations import (
@@ -31,6 +30,7 @@ from poise.motion.rotations import (
     shortest_arc,
     unwrap_quats,
 )
+from poise.motion.vectors import norm
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ def retarget(
             *(clip, world, passage, rot, root, feet, contacts), hold=config.contacts, clear=config.clear
         )
     flat = [unwrap_quats(normalize(rot[:, j])) for j in range(len(target))]
-    made = Clip(target, root.numpy(), torch.stack(flat, 1).numpy(), clip.fps, clip.name, clip.cyclic)
+    made = Clip(target, root, np.stack(flat, 1), clip.fps, clip.name, clip.cyclic)
     seconds = time.perf_counter() - began
     worlds = world, ClipWorld.of(made)
     return made, measure(worlds, clip.fps, passage, feet, contacts, seconds)
 
 
 _ARM = ("upper_arm", "forearm", "hand")
-_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+_UP = np.array([0.0, 0.0, 1.0], dtype=float)
 
 
 class RestPoseResult(NamedTuple):
@@ -128,29 +128,29 @@ def with_rest_pose(clip: Clip) -> RestPoseResult:
     """
     roles = find_roles(clip.skeleton)
     common = common_pose(roles, clip)
-    rot = torch.tensor(common.rot)
+    rot = common.rot.copy()
     _straighten(roles, rot)
     for side in SIDES:
         _spread(roles, rot, side)
-    face = axis_angle_to_quat(_UP, torch.tensor(-math.pi / 2, dtype=torch.float64))
-    rot = quat_mul(face.expand_as(rot), rot)
-    world = torch.tensor(clip.world()[1])
-    turned = quat_mul(world, quat_conj(rot).expand_as(world))
+    face = axis_angle_to_quat(_UP, np.asarray(-math.pi / 2, dtype=float))
+    rot = quat_mul(np.broadcast_to(face, rot.shape), rot)
+    world = clip.world()[1]
+    turned = quat_mul(world, np.broadcast_to(quat_conj(rot), world.shape))
     parents = clip.skeleton.parents
     local = [turned[:, 0]]
     local += [quat_between(turned[:, p], turned[:, j]) for j, p in enumerate(parents) if p >= 0]
-    made = replace(clip, skeleton=_skeleton(clip.skeleton, rot), rot=torch.stack(local, 1).numpy())
-    angle = 2 * torch.acos(rot[:, 0].abs().clamp(max=1.0))
+    made = replace(clip, skeleton=_skeleton(clip.skeleton, rot), rot=np.stack(local, 1))
+    angle = 2 * np.arccos(np.minimum(np.abs(rot[:, 0]), 1.0))
     return RestPoseResult(made, common.evidence, math.degrees(float(angle.mean())))
 
 
-def _skeleton(skeleton: Skeleton, rot: Tensor) -> Skeleton:
+def _skeleton(skeleton: Skeleton, rot: np.ndarray) -> Skeleton:
     """The skeleton with a rest pose of world rotations `rot (J, 4)`; what its file's own frames
     say is forgotten."""
-    offsets = torch.tensor(skeleton.offsets)
+    offsets = skeleton.offsets.copy()
     above = rot[[max(p, 0) for p in skeleton.parents]]
     ends = tuple(
-        (j, tuple(quat_rotate(rot[j], torch.tensor(tip, dtype=torch.float64)).tolist()))
+        (j, tuple(quat_rotate(rot[j], np.asarray(tip, dtype=float)).tolist()))
         for j, tip in skeleton.ends
     )
     old = skeleton.source
@@ -163,10 +163,10 @@ def _skeleton(skeleton: Skeleton, rot: Tensor) -> Skeleton:
         extra=tuple(entry for entry in old.extra if entry[0] in ("roles", "root_position")),
         channels=channels,
     )
-    return replace(skeleton, offsets=quat_rotate(above, offsets).numpy(), ends=ends, source=source)
+    return replace(skeleton, offsets=quat_rotate(above, offsets), ends=ends, source=source)
 
 
-def _straighten(roles: Roles, rot: Tensor) -> None:
+def _straighten(roles: Roles, rot: np.ndarray) -> None:
     """Turns the trunk until the neck, or the head, stands over the foot of the spine."""
     spine, tops = roles.chain("spine"), (*roles.chain("neck")[:1], *roles.chain("head"))
     if spine and tops:
@@ -174,28 +174,28 @@ def _straighten(roles: Roles, rot: Tensor) -> None:
         _swing(roles, rot, spine[0], pos[tops[0]] - pos[spine[0]], _UP)
 
 
-def _spread(roles: Roles, rot: Tensor, side: str) -> None:
+def _spread(roles: Roles, rot: np.ndarray, side: str) -> None:
     """Turns an arm until its bones point aside."""
     joints = [j for kind in _ARM if (j := roles.joint(f"{side}_{kind}")) is not None]
-    aside = torch.tensor([0.0, 1.0 if side == "left" else -1.0, 0.0], dtype=torch.float64)
+    aside = np.array([0.0, 1.0 if side == "left" else -1.0, 0.0], dtype=float)
     for a, b in itertools.pairwise(joints):
         pos = _places(roles.skeleton, rot)
         _swing(roles, rot, a, pos[b] - pos[a], aside)
 
 
-def _swing(roles: Roles, rot: Tensor, joint: int, now: Tensor, wanted: Tensor) -> None:
+def _swing(roles: Roles, rot: np.ndarray, joint: int, now: np.ndarray, wanted: np.ndarray) -> None:
     """Turns a joint and what hangs on it by the smallest turn that brings `now` to `wanted`."""
-    if float(now.norm()) < 1e-6:
+    if float(norm(now)) < 1e-6:
         return
     below = subtree(roles.skeleton, joint)
-    turn = shortest_arc(now / now.norm(), wanted)
-    rot[below] = quat_mul(turn.expand(len(below), 4), rot[below])
+    turn = shortest_arc(now / norm(now), wanted)
+    rot[below] = quat_mul(np.broadcast_to(turn, (len(below), 4)), rot[below])
 
 
-def _places(skeleton: Skeleton, rot: Tensor) -> Tensor:
+def _places(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
     """`(J, 3)` m, of a pose with the world rotations `rot (J, 4)`."""
-    out = [torch.zeros(3, dtype=torch.float64)]
+    out = [np.zeros(3)]
     for j, p in enumerate(skeleton.parents):
         if p >= 0:
-            out.append(out[p] + quat_rotate(rot[p], torch.tensor(skeleton.offsets[j])))
-    return torch.stack(out)
+            out.append(out[p] + quat_rotate(rot[p], skeleton.offsets[j]))
+    return np.stack(out)

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
@@ -17,8 +15,8 @@ from poise.formats.markers import NEEDED, find_places
 from poise.formats.point_fit import FitConfig, bones_of, fit_clip
 from poise.formats.point_skeleton import Rest, Solver, hold_lengths, measure, spine_shares, trunk_tracks
 from poise.kinematics.ground import fit_heights
-from poise.kinematics.retarget.passage import Retargeter
-from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.retargeting.passage import Retargeter
+from poise.kinematics.retargeting.standing import ClipWorld
 from poise.kinematics.stream_noise import of_points
 from poise.motion import Clip, Skeleton
 from poise.motion.keypoints import Keypoints
@@ -77,7 +75,7 @@ class PointBody:
             )
         config = FitConfig()
         marks = complete(points, config.max_gap_s, config.drop_spikes, config.smooth_hz)
-        seen = {p: torch.tensor(t) for p, t in marks.tracks.items() if p in found}
+        seen = {p: t for p, t in marks.tracks.items() if p in found}
         tracks, spine = trunk_tracks(seen, [])
         share = spine_shares({**seen, "neck": tracks["neck"], "pelvis": tracks["pelvis"]})
         rest = measure(tracks, spine, [])
@@ -97,7 +95,7 @@ class PointBody:
         )
         places = np.stack([_mean(points.positions, k) for k in body.places.values()], 1)
         pos, quat = body.pose(places)
-        whole = ~torch.isnan(pos).flatten(1).any(1)
+        whole = ~np.isnan(pos).any((1, 2))
         fit = fit_heights(table, pos[whole], quat[whole], points.fps)
         return replace(body, lift=fit.lift_m)
 
@@ -105,43 +103,43 @@ class PointBody:
         """Positions `(T, B, 3)` m of the humanoid's bodies for keypoints `(T, K, 3)` m without gaps."""
         tracks = np.stack([_mean(positions, k) for k in self.places.values()], 1)
         pos = self.pose(tracks)[0]
-        return (pos + torch.tensor([0.0, 0.0, self.lift])).numpy()
+        return pos + np.array([0.0, 0.0, self.lift])
 
-    def pose(self, places: np.ndarray) -> tuple[Tensor, Tensor]:
+    def pose(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World positions `(T, B, 3)` m and rotations `(T, B, 4)` of the bodies, not yet lifted.
 
         places: `(T, P, 3)` m, the tracks of `self.places` in order.
         """
         return self._onto(self._world(*self._solved(places)))
 
-    def _onto(self, performer: ClipWorld) -> tuple[Tensor, Tensor]:
+    def _onto(self, performer: ClipWorld) -> tuple[np.ndarray, np.ndarray]:
         rot, root = self.passage.transfer(performer)
         pos, quat = self.onto.forward(root, rot)
         rows = [r.joint for r in self.table.rows]
         return pos[:, rows], quat[:, rows]
 
-    def follow(self, positions: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    def follow(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The humanoid's bodies `(T, B, 3)` m as `solve` gives them, and what `performer` gives."""
         root, rot = self.performer(positions)
-        pos = self._onto(self._world(root, rot))[0] + torch.tensor([0.0, 0.0, self.lift])
+        pos = self._onto(self._world(root, rot))[0] + np.array([0.0, 0.0, self.lift])
         return pos, root, rot
 
-    def performer(self, positions: np.ndarray) -> tuple[Tensor, Tensor]:
+    def performer(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Root `(T, 3)` m and local rotations `(T, J, 4)` of the measured skeleton, its joints in the
         order of `rest`, for keypoints `(T, K, 3)` m without gaps."""
         return self._solved(np.stack([_mean(positions, k) for k in self.places.values()], 1))
 
-    def _solved(self, places: np.ndarray) -> tuple[Tensor, Tensor]:
-        seen = {p: torch.tensor(places[:, k]) for k, p in enumerate(self.places)}
+    def _solved(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        seen = {p: places[:, k] for k, p in enumerate(self.places)}
         tracks, _ = trunk_tracks(seen, [], self.share)
         tracks = hold_lengths(tracks, self.bones, LENGTH_ROUNDS)
         return Solver(self.rest, tracks, _NO_MEMORY_FPS).run()
 
-    def _world(self, root: Tensor, rot: Tensor) -> ClipWorld:
+    def _world(self, root: np.ndarray, rot: np.ndarray) -> ClipWorld:
         """The measured skeleton in every frame."""
         names = list(self.rest.parents)
         parents = tuple(-1 if up is None else names.index(up) for up in self.rest.parents.values())
-        offsets = torch.tensor(np.stack([self.rest.offsets[n] for n in names]))
+        offsets = np.stack([self.rest.offsets[n] for n in names])
         return ClipWorld(*forward_kinematics(parents, offsets, root, rot))
 
 

@@ -12,7 +12,7 @@ import torch
 from poise.formats import read_clip
 from poise.motion import Clip, Skeleton
 from poise.motion.rotations import forward_kinematics, quat_rotate
-from poise.motion.windows import (
+from poise.synthesis.windows import (
     centred,
     cut,
     faced,

@@ -7,13 +7,11 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body.topology import subtree
 from poise.errors import PoiseError
 from poise.kinematics.forward import carried
-from poise.kinematics.retarget.standing import (
+from poise.kinematics.retargeting.standing import (
     ClipWorld,
     Stances,
     hinge_axis,
@@ -33,6 +31,7 @@ from poise.motion.rotations import (
     quat_rotate_inv,
     shortest_arc,
 )
+from poise.motion.vectors import cross, norm
 
 #: Where a skeleton has no toes: how far ahead of the ankle it treads, and how high such a point and the
 #: ankle lie above the sole, as shares of the leg.
@@ -73,14 +72,14 @@ class CommonPose:
 
     def depth(
         self, world: ClipWorld, ground: float = 0.0, joints: Collection[int] | None = None
-    ) -> Tensor:
+    ) -> np.ndarray:
         """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
 
         The floor lies as far under the `ground` of the treads as the soles do while standing.
         """
-        return (ground - self.sole - self.lowest(world, joints)).clamp_min(0.0)
+        return np.maximum(ground - self.sole - self.lowest(world, joints), 0.0)
 
-    def lowest(self, world: ClipWorld, joints: Collection[int] | None = None) -> Tensor:
+    def lowest(self, world: ClipWorld, joints: Collection[int] | None = None) -> np.ndarray:
         """`(T)` m, the lowest of those of `joints` (default: all) that are parts of the body, of their
         tips and treads; infinite without any part."""
         roles, (pos, quat) = self.roles, world
@@ -91,8 +90,8 @@ class CommonPose:
             if j in joints:
                 heights.append(carried(pos[:, j], quat[:, j], tip)[:, 2])
         if not heights:
-            return torch.full((len(pos),), torch.inf, dtype=pos.dtype)
-        return torch.stack(heights, -1).min(-1).values
+            return np.full((len(pos),), np.inf, dtype=pos.dtype)
+        return np.stack(heights, -1).min(-1)
 
 
 def common_pose(roles: Roles, clip: Clip | None = None, world: ClipWorld | None = None) -> CommonPose:
@@ -116,7 +115,7 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: ClipWorld | None 
         world = ClipWorld.of(clip)
     at_rest = rest_axes(roles)
     if at_rest is not None:
-        local = torch.zeros(len(roles.skeleton), 4, dtype=torch.float64)
+        local = np.zeros((len(roles.skeleton), 4))
         local[:, 0] = 1.0
         local[0] = at_rest
         evidence = "its rest pose stands"
@@ -153,7 +152,7 @@ class _Builder:
     def __init__(
         self,
         roles: Roles,
-        local: Tensor,
+        local: np.ndarray,
         clip: Clip | None,
         world: ClipWorld | None,
         rested: bool,
@@ -170,7 +169,7 @@ class _Builder:
 
     def build(self) -> CommonPose:
         self._check_toes()
-        rot = self.quat.clone()
+        rot = self.quat.copy()
         for j in range(1, len(self.skeleton)):
             rot[j] = quat_mul(rot[self.skeleton.parents[j]], self.local[j])
             role = self.roles.role(j)
@@ -188,28 +187,28 @@ class _Builder:
             for kinds in (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot")):
                 self._align_hinge(rot, side, kinds)
         parents = self.skeleton.parents
-        local = torch.stack(
+        local = np.stack(
             [rot[0]] + [quat_between(rot[p], rot[j]) for j, p in enumerate(parents) if p >= 0]
         )
         pos, rot = pose_positions(self.roles, local)
         hips = (pos[self._joint("left_thigh")] + pos[self._joint("right_thigh")]) / 2
         pos = pos - hips
         feet = [self._joint(f"{side}_foot") for side in SIDES]
-        treads = torch.stack([self._tread(pos, rot, side) for side in SIDES])
+        treads = np.stack([self._tread(pos, rot, side) for side in SIDES])
         heights = [
             float((pos[f] + quat_rotate(rot[f], t))[2]) for f, t in zip(feet, treads, strict=True)
         ]
-        above = torch.stack([identity()] * len(self.skeleton))
+        above = np.stack([identity()] * len(self.skeleton))
         if self.clip is not None and not self.rested:
-            above = torch.tensor(self.clip.rot[0])
+            above = self.clip.rot[0]
         tread = float(np.mean(heights))
         tips = tuple((r.joint, v) for r in self.roles.rows if (v := self._believed(r.joint)) is not None)
-        arrays = pos.numpy(), rot.numpy(), above.numpy(), treads.numpy()
+        arrays = pos, rot, above, treads
         pose = CommonPose(self.roles, *arrays, -tread, tips, 0.0, self.evidence)
         low = pose.lowest(ClipWorld(pos[None], rot[None]))
         return replace(pose, sole=max(0.0, tread - float(low[0])))
 
-    def _align_hinge(self, rot: Tensor, side: str, kinds: tuple[str, str, str]) -> None:
+    def _align_hinge(self, rot: np.ndarray, side: str, kinds: tuple[str, str, str]) -> None:
         """Twists the two bones of a limb until it bends as all limbs do: knees back, elbows forward.
 
         Hands and feet stay: palms and soles are known better from the standing pose.
@@ -222,10 +221,10 @@ class _Builder:
         if axis is None:
             return
         way = _way(side, kinds[0])
-        ahead = torch.tensor([1.0 if kinds[0] == "upper_arm" else -1.0, 0.0, 0.0], dtype=torch.float64)
-        wanted, now = torch.linalg.cross(way, ahead), quat_rotate(rot[limb[0]], axis)
-        angle = torch.atan2(torch.linalg.cross(now, wanted) @ way, now @ wanted)
-        if float(angle.abs()) > _MOST_TWIST:
+        ahead = np.array([1.0 if kinds[0] == "upper_arm" else -1.0, 0.0, 0.0], dtype=float)
+        wanted, now = cross(way, ahead), quat_rotate(rot[limb[0]], axis)
+        angle = np.arctan2(cross(now, wanted) @ way, now @ wanted)
+        if float(np.abs(angle)) > _MOST_TWIST:
             return
         ends = subtree(self.skeleton, limb[2])
         for j in set(subtree(self.skeleton, limb[0])) - set(ends):
@@ -243,7 +242,7 @@ class _Builder:
             foot, toes = self._joint(f"{side}_foot"), self.roles.joint(f"{side}_toes")
             if toes is not None:
                 line = self.pos[toes] - self.pos[foot]
-                ahead.append(float(line[0] / line.norm().clamp_min(1e-9)))
+                ahead.append(float(line[0] / np.maximum(norm(line), 1e-9)))
         if len(ahead) == 2 and max(ahead) < -0.5:
             raise PoiseError(
                 "its toes point backwards, so left and right seem to be swapped",
@@ -256,7 +255,7 @@ class _Builder:
         total = 0.0
         for side in SIDES:
             thigh, shin, foot = (self.pos[self._joint(f"{side}_{k}")] for k in ("thigh", "shin", "foot"))
-            bones = (shin - thigh).norm(), (foot - shin).norm()
+            bones = norm(shin - thigh), norm(foot - shin)
             if float(min(bones)) < 1e-4:
                 raise PoiseError(
                     f"the {side} leg has a bone of no length",
@@ -266,14 +265,14 @@ class _Builder:
             total += float(sum(bones)) / 2
         return total
 
-    def _bone(self, j: int, side: str, kind: str) -> Tensor | None:
+    def _bone(self, j: int, side: str, kind: str) -> np.ndarray | None:
         """The bone from joint `j` to the next one of its limb, in its own frame; None where unknown."""
         if kind == "hand":
             tip = self._hand_tip(j, side)
         else:
             after = self.roles.joint(f"{side}_{_NEXT[kind]}")
             tip = None if after is None else self.pos[after]
-        if tip is None or float((tip - self.pos[j]).norm()) < 1e-4:
+        if tip is None or float(norm(tip - self.pos[j])) < 1e-4:
             return None
         return quat_rotate_inv(self.quat[j], tip - self.pos[j])
 
@@ -284,59 +283,59 @@ class _Builder:
                 return tip
         return None
 
-    def _tip(self, j: int) -> Tensor | None:
+    def _tip(self, j: int) -> np.ndarray | None:
         tip = self._believed(j)
-        return None if tip is None else torch.tensor(tip, dtype=torch.float64)
+        return None if tip is None else np.asarray(tip, dtype=float)
 
-    def _hand_tip(self, j: int, side: str) -> Tensor | None:
+    def _hand_tip(self, j: int, side: str) -> np.ndarray | None:
         for finger in ("middle", "fingers", "index", "ring"):
             joints = [x for n in (0, 1) if (x := self.roles.joint(f"{side}_{finger}{n}")) is not None]
-            far = [x for x in joints if float((self.pos[x] - self.pos[j]).norm()) > 1e-3]
+            far = [x for x in joints if float(norm(self.pos[x] - self.pos[j])) > 1e-3]
             if far:
                 return self.pos[far[0]]
         tip = self._tip(j)
         return None if tip is None else self.pos[j] + quat_rotate(self.quat[j], tip)
 
-    def _toe(self, j: int, side: str) -> Tensor | None:
+    def _toe(self, j: int, side: str) -> np.ndarray | None:
         """Where the foot points, in its own frame; None where the file does not say."""
         toes = self.roles.joint(f"{side}_toes")
         if toes is not None:
             return quat_rotate_inv(self.quat[j], self.pos[toes] - self.pos[j])
         return self._tip(j)
 
-    def _foot(self, j: int, side: str) -> Tensor:
+    def _foot(self, j: int, side: str) -> np.ndarray:
         """The foot's world rotation: flat, and its toe straight ahead."""
         rot, toe = self.quat[j], self._toe(j, side)
-        if toe is None or float(quat_rotate(rot, toe)[:2].norm()) < 0.03 * self.leg:
+        if toe is None or float(norm(quat_rotate(rot, toe)[:2])) < 0.03 * self.leg:
             return rot
         if not self.rested:
             seen = self.stance.mean(j)
             rot = rot if seen is None else seen
-        z, y = torch.eye(3, dtype=torch.float64)[[2, 1]]
+        z, y = np.eye(3)[[2, 1]]
         ahead = quat_rotate(rot, toe)
-        rot = quat_mul(axis_angle_to_quat(z, -torch.atan2(ahead[1], ahead[0])), rot)
-        tilt = torch.atan2(ahead[2], ahead[:2].norm())
+        rot = quat_mul(axis_angle_to_quat(z, -np.arctan2(ahead[1], ahead[0])), rot)
+        tilt = np.arctan2(ahead[2], norm(ahead[:2]))
         stood = self.stance.tilt()
         if stood is not None and (not self.rested or abs(stood - float(tilt)) > _FOOT_TILT):
             # A turn about +y by a positive angle lowers what points along +x.
             rot = quat_mul(axis_angle_to_quat(y, tilt - stood), rot)
         return rot
 
-    def _tread(self, pos: Tensor, rot: Tensor, side: str) -> Tensor:
+    def _tread(self, pos: np.ndarray, rot: np.ndarray, side: str) -> np.ndarray:
         """The point on which a foot stands and rolls, in the foot's frame."""
         j, toes = self._joint(f"{side}_foot"), self.roles.joint(f"{side}_toes")
-        if toes is not None and float((pos[toes] - pos[j]).norm()) > 0.03 * self.leg:
+        if toes is not None and float(norm(pos[toes] - pos[j])) > 0.03 * self.leg:
             return quat_rotate_inv(rot[j], pos[toes] - pos[j])
         tip = self._toe(j, side)
         low = 0.0 if tip is None else -float(quat_rotate(rot[j], tip)[2]) / self.leg
         # The tip of a toe lies on the sole at most; many were made up higher.
         ankle = low if _ANKLE_HEIGHT < low < 2 * _ANKLE_HEIGHT else _ANKLE_HEIGHT
-        ahead = torch.tensor([_TREAD, 0.0, _TREAD_HEIGHT - ankle], dtype=torch.float64) * self.leg
+        ahead = np.array([_TREAD, 0.0, _TREAD_HEIGHT - ankle], dtype=float) * self.leg
         return quat_rotate_inv(rot[j], ahead)
 
 
-def _way(side: str, kind: str) -> Tensor:
+def _way(side: str, kind: str) -> np.ndarray:
     """The common direction of a limb's bone."""
     out = 1.0 if side == "left" else -1.0
     leg = kind in ("thigh", "shin")
-    return normalize(torch.tensor([0.0, 0.0 if leg else out, -1.0], dtype=torch.float64))
+    return normalize(np.array([0.0, 0.0 if leg else out, -1.0], dtype=float))

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, resample
-from poise.motion.noise import side_pairs
+from poise.motion.mirror import level_normal, other_sides
 from poise.motion.rotations import (
     axis_heading,
     forward_kinematics,
@@ -31,6 +31,7 @@ from poise.motion.rotations import (
     unwrap_quats,
 )
 from poise.motion.skeleton import Skeleton, triple
+from poise.motion.vectors import Array, namespace
 
 #: Harvey's contacts: squared step under 0.02 cm^2; two-stage's: sum of |dx| under 0.2 cm.
 CONTACT_LIMITS = {"harvey": 2e-6, "two-stage": 2e-3}
@@ -127,7 +128,7 @@ def pack_frames(
             raise PoiseError(
                 "the clips do not share a skeleton", clip.name, hint, code="skeleton-differs"
             )
-    rot = [unwrap_quats(normalize(torch.tensor(c.rot))) for c in clips]
+    rot = [torch.from_numpy(unwrap_quats(normalize(c.rot))) for c in clips]
     sizes = torch.tensor([0] + [c.frames for c in clips])
     bank = FrameBank(
         one.names,
@@ -208,7 +209,7 @@ def facing_axis(bank: FrameBank) -> tuple[float, float, float]:
     ahead = torch.zeros_like(bank.root[rows])
     for ankle, toe in zip(bank.feet[::2], bank.feet[1::2], strict=False):
         ahead = ahead + pos[:, toe] - pos[:, ankle]
-    up = normalize(quat_rotate(inverse, torch.tensor([0.0, 0, 1]).to(ahead).expand_as(ahead)).mean(0))
+    up = normalize(quat_rotate(inverse, torch.tensor([0.0, 0, 1]).to(ahead)).mean(0))
     axis = quat_rotate(inverse, ahead).mean(0)
     axis = axis - (axis @ up) * up
     if float(axis.norm()) < 1e-6:
@@ -253,16 +254,16 @@ def faced(
     return quat_rotate(back, root), turned
 
 
-def step_contacts(points: Tensor, rule: Literal["harvey", "two-stage"] = "harvey") -> Tensor:
+def step_contacts(points: Array, rule: Literal["harvey", "two-stage"] = "harvey") -> Array:
     """Contact `(..., T, F)` bool of foot joints `(..., T, F, 3)` m at 30 fps, told from steps alone.
 
     harvey: |p(t+1) - p(t)|^2 < 0.02 cm^2 (4.2 cm/s). two-stage: sum of |dx| < 0.2 cm. The last frame
     repeats the one before; heights do not matter. The two disagree on purpose.
     """
-    step = torch.diff(points, dim=-3)
-    size = step.square().sum(-1) if rule == "harvey" else step.abs().sum(-1)
+    step = points[..., 1:, :, :] - points[..., :-1, :, :]
+    size = (step * step).sum(-1) if rule == "harvey" else abs(step).sum(-1)
     label = size < CONTACT_LIMITS[rule]
-    return torch.cat((label, label[..., -1:, :]), -2)
+    return namespace(label).concat((label, label[..., -1:, :]), axis=-2)
 
 
 def train_statistics(
@@ -287,34 +288,6 @@ def train_statistics(
     return mean, (square / count - mean.square()).clamp_min(0).sqrt()
 
 
-#: A rest pose is not upright if its sides differ in height by more than this share of their distance.
-_LEVEL = 0.2
-
-
-def other_sides(names: tuple[str, ...], parents: tuple[int, ...]) -> Tensor:
-    """For each joint the one on the other side `(J)`, itself for those in the middle.
-
-    Raises:
-        PoiseError: no joint's name tells a side, or the sides have different hierarchies.
-    """
-    other = torch.arange(len(names))
-    for left, right, _ in side_pairs(names):
-        other[left], other[right] = right, left
-    if bool((other == torch.arange(len(names))).all()):
-        raise PoiseError(
-            "no joint's name tells left from right",
-            hint="Name joints LeftArm, RightArm",
-            code="sides-unknown",
-        )
-    for j, parent in enumerate(parents):
-        if parent >= 0 and int(other[parent]) != parents[int(other[j])]:
-            raise PoiseError(
-                f"'{names[j]}' and '{names[int(other[j])]}' hang on different joints",
-                code="mirror-unknown",
-            )
-    return other
-
-
 def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
     """The bank's clips in a mirror that stands upright between left and right at rest.
 
@@ -326,7 +299,7 @@ def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
         PoiseError: sides that are not named, or a rest pose that does not stand upright.
     """
     other = other_sides(bank.names, bank.parents)
-    normal = _normal(bank.names, bank.parents, bank.offsets)
+    normal = torch.from_numpy(level_normal(bank.names, bank.parents, bank.offsets.numpy()))
     mirror = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
     rot = bank.rot[:, other]
     rot = torch.cat((rot[..., :1], -(rot[..., 1:] @ mirror.to(rot))), -1)
@@ -334,54 +307,6 @@ def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
     names = tuple(f"{name}{suffix}" for name in bank.clips)
     root = bank.root @ mirror.to(bank.root)
     return replace(bank, root=root, rot=rot, offsets=offsets, clips=names)
-
-
-def mirrored_clip(clip: Clip) -> Clip:
-    """A clip in a mirror, on bones in a mirror; see `mirrored` for the formulas.
-
-    The mirror stands between left and right as they lie at rest, or, in a skeleton with a rest that is
-    not upright, across the y axis; another mirror only changes the way that the clip goes.
-
-    Raises:
-        PoiseError: sides that are not named.
-    """
-    skeleton = clip.skeleton
-    other = other_sides(skeleton.names, skeleton.parents)
-    offsets = torch.tensor(skeleton.offsets)
-    try:
-        normal = _normal(skeleton.names, skeleton.parents, offsets[None])
-    except PoiseError:
-        normal = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    mirror = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
-    root, rot = clip.tensors()
-    rot = torch.cat((rot[:, other, :1], -(rot[:, other, 1:] @ mirror)), -1)
-    ends = tuple(
-        (int(other[j]), tuple((torch.tensor(v, dtype=torch.float64) @ mirror).tolist()))
-        for j, v in skeleton.ends
-    )
-    seen = replace(skeleton, offsets=(offsets[other] @ mirror).numpy(), ends=ends)
-    contacts = tuple((int(other[j]), touch) for j, touch in clip.contacts)
-    made = clip.replaced(skeleton=seen, root_pos=(root @ mirror).numpy(), rot=rot.numpy())
-    return made.replaced(contacts=contacts)
-
-
-def _normal(names: tuple[str, ...], parents: tuple[int, ...], offsets: Tensor) -> Tensor:
-    """The level unit vector from the right to the left at rest `offsets (C, J, 3)`, float64."""
-    rest = offsets.double().clone()
-    rest[:, 0] = 0.0
-    for j, parent in enumerate(parents):
-        if parent >= 0:
-            rest[:, j] += rest[:, parent]
-    apart = torch.zeros(3, dtype=torch.float64)
-    for left, right, _ in side_pairs(names):
-        apart = apart + (rest[:, left] - rest[:, right]).mean(0)
-    level = apart * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-    if float(level.norm()) < 1e-6 or abs(float(apart[2])) > _LEVEL * float(level.norm()):
-        raise PoiseError(
-            "the skeleton's left and right do not lie level at rest, so no mirror is known",
-            code="mirror-unknown",
-        )
-    return level / level.norm()
 
 
 def joined(a: FrameBank, b: FrameBank) -> FrameBank:

@@ -6,15 +6,13 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.body.topology import subtree
 from poise.kinematics.feet import TOUCH_M, contact_labels
 from poise.kinematics.forward import carried
 from poise.kinematics.limbs import Limb, match_positions
-from poise.kinematics.retarget.passage import Retargeter
-from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.retargeting.passage import Retargeter
+from poise.kinematics.retargeting.standing import ClipWorld
 from poise.motion import Clip
 from poise.motion.roles import SIDES
 from poise.motion.rotations import quat_rotate
@@ -38,10 +36,10 @@ class Foot:
     source: int
     target: int
     limb: Limb
-    tread_source: Tensor
-    tread_target: Tensor
+    tread_source: np.ndarray
+    tread_target: np.ndarray
 
-    def points(self, pos: Tensor, quat: Tensor, target: bool) -> Tensor:
+    def points(self, pos: np.ndarray, quat: np.ndarray, target: bool) -> np.ndarray:
         """`(T, 3)` m, where the held point is."""
         joint, tread = (self.target, self.tread_target) if target else (self.source, self.tread_source)
         return carried(pos[:, joint], quat[:, joint], tread)
@@ -64,38 +62,38 @@ def feet_of(passage: Retargeter) -> tuple[Foot, ...]:
             if np.linalg.norm(bones, axis=-1).min() < 1e-4:
                 # A bone of no length reaches nowhere.
                 continue
-            held = [torch.zeros(3, dtype=torch.float64)] * 2
+            held = [np.zeros(3)] * 2
             if label == "foot":
-                held = [torch.tensor(here.treads[k]), torch.tensor(there.treads[k])]
+                held = [here.treads[k], there.treads[k]]
             limb = Limb(*(p[1] for p in chain))
             out.append(Foot(f"{side} {label}", *chain[2], limb, held[0], held[1]))
     return tuple(out)
 
 
-def source_contacts(clip: Clip, world: ClipWorld, feet: tuple[Foot, ...], ground: float) -> Tensor:
+def source_contacts(clip: Clip, world: ClipWorld, feet: tuple[Foot, ...], ground: float) -> np.ndarray:
     """`(T, F)` bool, which end touches the ground in the source: as its file says, else low and slow."""
     out, said = [], dict(clip.contacts)
     for foot in feet:
         if foot.source in said:
-            out.append(torch.tensor(said[foot.source].any(1)))
+            out.append(said[foot.source].any(1))
             continue
         tread = foot.points(*world, target=False)[:, None]
         low = TOUCH_M[foot.name.split()[1]]
         out.append(contact_labels(tread, clip.fps, low, ground=ground)[:, 0])
-    return torch.stack(out, 1)
+    return np.stack(out, 1)
 
 
 def plant(
     clip: Clip,
     world: ClipWorld,
     passage: Retargeter,
-    rot: Tensor,
-    root: Tensor,
+    rot: np.ndarray,
+    root: np.ndarray,
     feet: tuple[Foot, ...],
-    contacts: Tensor,
+    contacts: np.ndarray,
     hold: bool,
     clear: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[np.ndarray, np.ndarray]:
     """New local rotations `(T, J, 4)` and root path `(T, 3)` of the target with its contacts kept.
 
     While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
@@ -106,30 +104,30 @@ def plant(
     skeleton, scale = passage.joints.target.skeleton, passage.scale
     depth = passage.here.depth(world, scale.ground) * scale.factor
 
-    def lift(pos: Tensor, quat: Tensor, parts: Collection[int]) -> Tensor:
+    def lift(pos: np.ndarray, quat: np.ndarray, parts: Collection[int]) -> np.ndarray:
         """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
         excess = passage.there.depth(ClipWorld(pos, quat), scale.ground, parts) - depth
         if float(excess.max()) < 1e-6:
-            return torch.zeros(len(pos), dtype=pos.dtype)
-        return torch.tensor(smooth_lift(excess.clamp_min(0.0).numpy(), clip.fps, LIFT_S, clip.cyclic))
+            return np.zeros(len(pos), dtype=pos.dtype)
+        return smooth_lift(np.maximum(excess, 0.0), clip.fps, LIFT_S, clip.cyclic)
 
     if clear:
         ends = {j for foot in feet for j in subtree(skeleton, foot.target)}
         pos, quat = skeleton.forward(root, rot)
-        up = torch.zeros_like(root)
+        up = np.zeros_like(root)
         up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
         root = root + up
     pos, quat = skeleton.forward(root, rot)
-    goals: dict[int | str, Tensor] = {}
+    goals: dict[int | str, np.ndarray] = {}
     for k, foot in enumerate(feet):
         goal = pos[:, foot.target]
         if hold:
-            arm = quat_rotate(quat[:, foot.target], foot.tread_target.expand(len(pos), 3))
+            arm = quat_rotate(quat[:, foot.target], np.broadcast_to(foot.tread_target, (len(pos), 3)))
             wanted = scale.place(foot.points(*world, target=False)) - arm
             goal = goal + contact_weight(contacts[:, k], clip.fps)[:, None] * (wanted - goal)
         if clear:
             moved = pos + (goal - pos[:, foot.target])[:, None]
-            up = torch.zeros_like(goal)
+            up = np.zeros_like(goal)
             up[:, 2] = lift(moved, quat, subtree(skeleton, foot.target))
             goal = goal + up
         goals[foot.target] = goal
@@ -137,20 +135,20 @@ def plant(
     rot = match_positions(skeleton, rot, root, goals, by_end)
     if clear:
         pos, quat = skeleton.forward(root, rot)
-        up = torch.zeros_like(root)
+        up = np.zeros_like(root)
         up[:, 2] = lift(pos, quat, range(len(skeleton)))
         root = root + up
     return rot, root
 
 
-def contact_weight(contact: Tensor, fps: float) -> Tensor:
+def contact_weight(contact: np.ndarray, fps: float) -> np.ndarray:
     """`(T)` in [0, 1]: 1 where `contact (T)` holds, falling to 0 over `BLEND_S` around it."""
     if not bool(contact.any()):
-        return torch.zeros(len(contact), dtype=torch.float64)
-    frames = torch.arange(len(contact))
+        return np.zeros(len(contact))
+    frames = np.arange(len(contact))
     at = frames[contact]
-    k = torch.searchsorted(at, frames)
-    after = at[k.clamp(max=len(at) - 1)]
-    before = at[(k - 1).clamp(min=0)]
-    away = torch.minimum((after - frames).abs(), (frames - before).abs()).double() / fps
-    return 0.5 + 0.5 * torch.cos(torch.pi * (away / BLEND_S).clamp(max=1.0))
+    k = np.searchsorted(at, frames)
+    after = at[np.minimum(k, len(at) - 1)]
+    before = at[np.maximum(k - 1, 0)]
+    away = np.minimum(np.abs(after - frames), np.abs(frames - before)).astype(float) / fps
+    return 0.5 + 0.5 * np.cos(np.pi * np.minimum(away / BLEND_S, 1.0))

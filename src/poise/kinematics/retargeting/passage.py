@@ -9,17 +9,15 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.kinematics.feet import rest_height
 from poise.kinematics.forward import carried
-from poise.kinematics.retarget.common_pose import CommonPose, common_pose
-from poise.kinematics.retarget.standing import ClipWorld
+from poise.kinematics.retargeting.common_pose import CommonPose, common_pose
+from poise.kinematics.retargeting.standing import ClipWorld
 from poise.motion import Clip, Skeleton
-from poise.motion import quats as q
 from poise.motion.roles import SHARED, SIDES, JointMap, map_joints
+from poise.motion.rotations import normalize, quat_between, quat_conj, quat_mul, quat_rotate, slerp
 
 
 @dataclass(frozen=True)
@@ -41,14 +39,14 @@ class Scale:
         for side, tread in zip(SIDES, here.treads, strict=True):
             foot = here.roles.joint(f"{side}_foot") or 0
             treads.append(carried(pos[:, foot], quat[:, foot], tread))
-        ground = rest_height(torch.stack(treads, 1), fps)
+        ground = rest_height(np.stack(treads, 1), fps)
         hips = [pos[0, here.roles.joint(f"{s}_thigh") or 0] for s in SIDES]
         middle = (hips[0] + hips[1]) / 2
         return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground)
 
-    def place(self, x: Tensor) -> Tensor:
+    def place(self, x: np.ndarray) -> np.ndarray:
         """Points `(..., 3)` m of the source's world where the target has them."""
-        centre = torch.tensor(self.centre, dtype=x.dtype)
+        centre = self.centre
         # Written so that a factor of 1 changes no digit.
         return x + (self.factor - 1.0) * (x - centre)
 
@@ -143,34 +141,34 @@ class Retargeter:
         """The target's root `(..., 3)` m and world rotations `(..., J, 4)`, contacts as they come, for
         those of the source."""
         plan = self._plan
-        turned = q.mul(world, plan.back)
+        turned = quat_mul(world, plan.back)
         rest = self.there.rot
         out = np.empty((*world.shape[:-2], len(self.target), 4))
         onto, of = plan.direct
-        out[..., onto, :] = q.mul(turned[..., of, :], rest[onto])
+        out[..., onto, :] = quat_mul(turned[..., of, :], rest[onto])
         onto, low, high, shares = plan.bent
         if len(onto):
-            bent = q.slerp(turned[..., low, :], turned[..., high, :], shares)
-            out[..., onto, :] = q.mul(bent, rest[onto])
+            bent = slerp(turned[..., low, :], turned[..., high, :], shares)
+            out[..., onto, :] = quat_mul(bent, rest[onto])
         if plan.first is not None:
             out[..., 0, :] = plan.first
         for joints, parents, turns in plan.hanging:
-            out[..., joints, :] = q.mul(out[..., parents, :], turns)
-        out = q.normalized(out)
+            out[..., joints, :] = quat_mul(out[..., parents, :], turns)
+        out = normalize(out)
         (joints, arms), (own_joints, own_arms) = plan.ways
-        middle = root + q.rotate(world[..., joints, :], arms).sum(-2)
+        middle = root + quat_rotate(world[..., joints, :], arms).sum(-2)
         moved = middle + (self.scale.factor - 1.0) * (middle - np.array(self.scale.centre))
-        return moved - q.rotate(out[..., own_joints, :], own_arms).sum(-2), out
+        return moved - quat_rotate(out[..., own_joints, :], own_arms).sum(-2), out
 
-    def transfer(self, world: ClipWorld) -> tuple[Tensor, Tensor]:
+    def transfer(self, world: ClipWorld) -> tuple[np.ndarray, np.ndarray]:
         """Local rotations `(T, J, 4)` and root path `(T, 3)` of the target for the source's joints."""
-        root, there = self(world.pos[:, 0].numpy(), world.quat.numpy())
-        return torch.from_numpy(local_of(self.target, there)), torch.from_numpy(root)
+        root, there = self(world.pos[:, 0], world.quat)
+        return local_of(self.target, there), root
 
 
-def hip_middle(joints: JointMap, pos: Tensor, side: int) -> Tensor:
+def hip_middle(joints: JointMap, pos: np.ndarray, side: int) -> np.ndarray:
     """`(T, 3)` m, the middle between the hip joints of the source (0) or target (1)."""
-    return sum((pos[:, x[side]] for x in _hips(joints)), torch.zeros(())) / 2
+    return sum((pos[:, x[side]] for x in _hips(joints)), np.zeros(())) / 2
 
 
 def _hips(joints: JointMap) -> list[tuple[int, int]]:
@@ -190,7 +188,7 @@ def _plan_of(joints: JointMap, here: CommonPose, there: CommonPose, share: bool)
         parents = [target.parents[j] for j in free]
         if free:
             # What hangs on its parent as it does at rest.
-            turns = q.between(there.rot[parents], there.rot[free])
+            turns = quat_between(there.rot[parents], there.rot[free])
             turns = np.stack(
                 [there.above[j] if j in above else t for j, t in zip(free, turns, strict=True)]
             )
@@ -206,7 +204,7 @@ def _plan_of(joints: JointMap, here: CommonPose, there: CommonPose, share: bool)
         None if 0 in done else there.above[0],
         hanging,
         ways,
-        q.conj(here.rot),
+        quat_conj(here.rot),
     )
 
 
@@ -295,12 +293,12 @@ def world_of(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
     """World rotations `(..., J, 4)` of local ones."""
     out = rot.copy()
     for joints, above in doublings(tuple(skeleton.parents)):
-        out[..., joints, :] = q.mul(out[..., above, :], out[..., joints, :])
+        out[..., joints, :] = quat_mul(out[..., above, :], out[..., joints, :])
     return out
 
 
 def local_of(skeleton: Skeleton, world: np.ndarray) -> np.ndarray:
     """Local rotations `(..., J, 4)` of those in the world."""
-    out = q.between(world[..., np.maximum(skeleton.parents, 0), :], world)
+    out = quat_between(world[..., np.maximum(skeleton.parents, 0), :], world)
     out[..., 0, :] = world[..., 0, :]
     return out

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from poise.body import BodyConfig, BodyTable, generate_table
 from poise.errors import PoiseError
 from poise.kinematics.forward import carried
-from poise.kinematics.retarget.common_pose import CommonPose, common_pose
-from poise.kinematics.retarget.standing import ClipWorld
-from poise.kinematics.retarget.transfer import RetargetConfig
+from poise.kinematics.retargeting.common_pose import CommonPose, common_pose
+from poise.kinematics.retargeting.standing import ClipWorld
+from poise.kinematics.retargeting.transfer import RetargetConfig
 from poise.motion import Clip, Skeleton
 from poise.motion.roles import ARM, LEG, SHARED, SIDES, map_joints
 from poise.motion.rotations import quat_rotate, quat_rotate_inv
@@ -94,7 +93,7 @@ def own_skeleton(clip: Clip, example: Clip) -> Skeleton:
     joints = map_joints(clip.skeleton, example.skeleton)
     here, there = common_pose(joints.source, clip), common_pose(joints.target, example)
     places = _places(replace(here, pos=_arms_at_ease(here, clip)), there)
-    skeleton, rot = example.skeleton, torch.tensor(there.rot)
+    skeleton, rot = example.skeleton, there.rot.copy()
     scale = _leg(here) / _leg(there)
     pos = np.zeros_like(there.pos)
     for j, parent in enumerate(skeleton.parents):
@@ -108,7 +107,7 @@ def own_skeleton(clip: Clip, example: Clip) -> Skeleton:
     offsets = skeleton.offsets.copy()
     for j, parent in enumerate(skeleton.parents):
         if parent >= 0:
-            offsets[j] = quat_rotate_inv(rot[parent], torch.tensor(pos[j] - pos[parent])).numpy()
+            offsets[j] = quat_rotate_inv(rot[parent], (pos[j] - pos[parent]))
     ends = tuple((j, (scale * x, scale * y, scale * z)) for j, (x, y, z) in skeleton.ends)
     return replace(skeleton, offsets=offsets, ends=ends)
 
@@ -125,8 +124,8 @@ def _places(here: CommonPose, there: CommonPose) -> dict[int, np.ndarray]:
         toes, foot = target.joint(f"{side}_toes"), source.joint(f"{side}_foot") or 0
         if toes is not None:
             # On what the foot treads, the toe joint where there is one.
-            quat, tread = torch.tensor(here.rot[foot])[None], here.treads[which]
-            out[toes] = carried(torch.tensor(here.pos[foot])[None], quat, tread)[0].numpy()
+            quat, tread = here.rot[foot][None], here.treads[which]
+            out[toes] = carried(here.pos[foot][None], quat, tread)[0]
     hips = _leg(here) / _leg(there) * there.pos[target.joint("hips") or 0]
     for kinds, start in ((SHARED[:1], [hips]), (SHARED[1:], [])):
         a = [here.pos[j] for k in kinds for j in source.chain(k)]
@@ -149,13 +148,13 @@ def _arms_at_ease(pose: CommonPose, clip: Clip) -> np.ndarray:
     out, roles = pose.pos.copy(), pose.roles
     chest = (*roles.chain("spine")[-1:], roles.joint("hips") or 0)[0]
     places, quat = ClipWorld.of(clip)
-    turn = torch.tensor(pose.rot[chest])
+    turn = pose.rot[chest]
     for side in SIDES:
         arm = roles.joint(f"{side}_upper_arm")
         if arm is None or roles.joint(f"{side}_clavicle") is None:
             continue
         mean = quat_rotate_inv(quat[:, chest], places[:, arm] - places[:, chest]).mean(0)
-        move = pose.pos[chest] + quat_rotate(turn, mean).numpy() - pose.pos[arm]
+        move = pose.pos[chest] + quat_rotate(turn, mean) - pose.pos[arm]
         for kind in ARM[1:]:
             joint = roles.joint(f"{side}_{kind}")
             if joint is not None:

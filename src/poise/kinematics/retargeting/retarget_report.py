@@ -6,15 +6,14 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from poise.kinematics.retarget.passage import Retargeter, Scale, hip_middle
-from poise.kinematics.retarget.plant import Foot
-from poise.kinematics.retarget.standing import ClipWorld, body_axes
+from poise.kinematics.retargeting.passage import Retargeter, Scale, hip_middle
+from poise.kinematics.retargeting.plant import Foot
+from poise.kinematics.retargeting.standing import ClipWorld, body_axes
 from poise.metrics.tracking_errors import MM
 from poise.motion.roles import SIDES, JointMap
 from poise.motion.rotations import normalize
+from poise.motion.vectors import norm
 
 _BONES = (("upper_arm", "forearm"), ("forearm", "hand"), ("thigh", "shin"), ("shin", "foot"))
 
@@ -108,15 +107,15 @@ def measure(
     fps: float,
     passage: Retargeter,
     feet: tuple[Foot, ...],
-    contacts: Tensor,
+    contacts: np.ndarray,
     seconds: float,
 ) -> RetargetReport:
     """Measures what came of a retargeting; see `RetargetReport`. worlds: source and target."""
     joints, scale, poses = passage.joints, passage.scale, (passage.here, passage.there)
     bones = _bones(joints, worlds[0].pos, worlds[1].pos)
-    angles = torch.cat([a for _, a in bones]) if bones else torch.zeros(1)
+    angles = np.concatenate([a for _, a in bones]) if bones else np.zeros(1)
     trunk = [body_axes(p.roles, w.pos)[1] for p, w in zip(poses, worlds, strict=True)]
-    lean = [body_axes(p.roles, torch.tensor(p.pos))[1] for p in poses]
+    lean = [body_axes(p.roles, p.pos)[1] for p in poses]
     tilt = _angle(*trunk) - float(_angle(*lean))
     ends = _ends(passage, worlds[0].pos, worlds[1].pos)
     slide, held = _slide(feet, contacts, worlds, scale, fps)
@@ -132,7 +131,7 @@ def measure(
         tuple((name, float(a.mean()), float(a.max())) for name, a in bones),
         float(angles.mean()),
         float(angles.max()),
-        float(tilt.abs().mean()),
+        float(np.abs(tilt).mean()),
         ends,
         float(np.mean([e for _, e in ends])) if ends else 0.0,
         held,
@@ -143,13 +142,13 @@ def measure(
     )
 
 
-def _angle(a: Tensor, b: Tensor) -> Tensor:
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle in degrees between directions `(..., 3)`, exact for small ones too."""
     a, b = normalize(a), normalize(b)
-    return torch.rad2deg(2.0 * torch.atan2((a - b).norm(dim=-1), (a + b).norm(dim=-1)))
+    return np.rad2deg(2.0 * np.arctan2(norm(a - b), norm(a + b)))
 
 
-def _bones(joints: JointMap, source: Tensor, target: Tensor) -> list[tuple[str, Tensor]]:
+def _bones(joints: JointMap, source: np.ndarray, target: np.ndarray) -> list[tuple[str, np.ndarray]]:
     out = []
     for kind, after in _BONES:
         for side in SIDES:
@@ -157,13 +156,13 @@ def _bones(joints: JointMap, source: Tensor, target: Tensor) -> list[tuple[str, 
             if top is None or tip is None:
                 continue
             lines = source[:, tip[0]] - source[:, top[0]], target[:, tip[1]] - target[:, top[1]]
-            if min(float(line.norm(dim=-1).min()) for line in lines) < 1e-4:
+            if min(float(norm(line).min()) for line in lines) < 1e-4:
                 continue
             out.append((f"{side} {kind.replace('_', ' ')}", _angle(*lines)))
     return out
 
 
-def _ends(passage: Retargeter, source: Tensor, target: Tensor) -> tuple[tuple[str, float], ...]:
+def _ends(passage: Retargeter, source: np.ndarray, target: np.ndarray) -> tuple[tuple[str, float], ...]:
     a, b = (
         (pos - hip_middle(passage.joints, pos, which)[:, None]) / pose.hip_height
         for which, (pos, pose) in enumerate(((source, passage.here), (target, passage.there)))
@@ -172,14 +171,14 @@ def _ends(passage: Retargeter, source: Tensor, target: Tensor) -> tuple[tuple[st
     for role in ("left_hand", "right_hand", "left_foot", "right_foot", "head"):
         pair = passage.joints.limb_pair(role)
         if pair is not None:
-            apart = (a[:, pair[0]] - b[:, pair[1]]).norm(dim=-1).mean()
+            apart = norm(a[:, pair[0]] - b[:, pair[1]]).mean()
             out.append((role.replace("_", " "), float(apart) * 100))
     return tuple(out)
 
 
 def _slide(
     feet: tuple[Foot, ...],
-    contacts: Tensor,
+    contacts: np.ndarray,
     worlds: tuple[ClipWorld, ClipWorld],
     scale: Scale,
     fps: float,
@@ -193,7 +192,7 @@ def _slide(
         steps += int(both.sum())
         for which, factor in ((0, scale.factor), (1, 1.0)):
             point = foot.points(*worlds[which], target=bool(which))[:, :2]
-            total[which] += float(torch.diff(point, dim=0).norm(dim=-1)[both].sum()) * factor
+            total[which] += float(norm(np.diff(point, axis=0))[both].sum()) * factor
     seconds = steps / fps
     rate = [MM * t / seconds if steps else 0.0 for t in total]
     return (rate[0], rate[1]), seconds
