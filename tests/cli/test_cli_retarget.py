@@ -80,6 +80,32 @@ def test_the_report_can_be_json_alone(files, tmp_path: Path, capsys) -> None:
     assert {"direction_deg", "slide_mm_s", "depth_max_mm", "end_percent", "mapping"} <= set(facts)
 
 
+def test_hands_stay_where_they_are_if_asked(files, tmp_path: Path, capsys, refused) -> None:
+    # Legs of the source's size and arms a fifth longer: hands end elsewhere, or elbows bend.
+    rig = human()
+    arms = [k for k, n in enumerate(rig.names) if n.endswith(("ForeArm", "Hand"))]
+    offsets = np.array(rig.offsets)
+    offsets[arms] *= 1.2
+    still = np.zeros((3, len(rig), 4))
+    still[..., 0] = 1.0
+    onto = tmp_path / "long.bvh"
+    skeleton = Skeleton(rig.names, rig.parents, offsets, rig.ends)
+    write_clip(Clip(skeleton, np.tile((0.0, 0.0, 1.0), (3, 1)), still, 30.0), onto)
+    far, facts = {}, {}
+    source = read_clip(files[0])
+    for how in ("direction", "place"):
+        out = tmp_path / f"{how}.bvh"
+        argv = ["retarget", *map(str, (files[0], "--onto", onto, "-o", out)), "--hands", how, "--json"]
+        assert main(argv) == 0
+        facts[how] = json.loads(capsys.readouterr().out)["result"]
+        joint = source.skeleton.index("LeftHand")
+        gap = read_clip(out).positions()[:, joint] - source.positions()[:, joint]
+        far[how] = float(np.linalg.norm(gap, axis=-1).mean())
+    assert far["direction"] > 0.09 and far["place"] < 0.015
+    assert facts["direction"]["hands_percent"] is None and facts["place"]["hands_percent"][0] < 1.0
+    refused(*argv[:4], "-o", tmp_path / "x.bvh", "--hands", "floor", words=("--hands",))
+
+
 def test_pairs_by_hand(files, tmp_path: Path, capsys, refused) -> None:
     here, there = files
     out = tmp_path / "out.bvh"

@@ -321,6 +321,7 @@ def test_settings_as_words():
     assert " ".join(words) == "--keyframes 0,40,85 --touch right_hand:60:0.2,0.5,1.2"
     words = words_of(ACTIONS["rig"], {"maps": ["Arm=upperarm_l", "--x=y"]}, 86, {}, Path("b"))
     assert words == ["--map=Arm=upperarm_l", "--map=--x=y"]
+    assert words_of(ACTIONS["rig"], {"hands": "place"}, 86, {}, Path("b")) == ["--hands", "place"]
     assert words_of(ACTIONS["cut"], {"frames": [5, 9]}, 86, {}, Path("b")) == ["--frames", "5-9"]
     words = words_of(ACTIONS["range"], {"span": [1.0, 2.5]}, 86, {}, Path("b"))
     assert words == ["--range=1-2.5", "--seed", "1"]

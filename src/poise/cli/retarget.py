@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
@@ -24,6 +24,7 @@ def run(
     map: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="JOINT=JOINT")] = (),
     onto_skeleton: Annotated[Path | None, arg(metavar="ASF", help_behavior_hint="")] = None,
     contacts: Flag = True,
+    hands: Literal["direction", "place"] = "direction",
     force: Force = False,
     json: Json = False,
     reading: OmitArgPrefixes[Reading] = Reading(),
@@ -39,6 +40,8 @@ def run(
             part, such as left_upper_arm=upperarm_l.
         onto_skeleton: the ASF skeleton where FILE is an AMC.
         contacts: do not hold standing feet and hands where the clip has them.
+        hands: with direction arms point where those of the clip point; with place hands stay where they
+            are, from the hips, over the floor and on what they touch, and elbows bend to it.
     """
     from poise.formats import read_skeleton, write_clip
     from poise.kinematics import RetargetConfig, retarget, without_noise
@@ -46,7 +49,7 @@ def run(
     may_write(out, force, clip, onto)
     mapping = pairs(map)
     source, target = reading.read(clip), read_skeleton(onto, onto_skeleton)
-    config = RetargetConfig(contacts=contacts, clear=contacts)
+    config = RetargetConfig(contacts=contacts, clear=contacts, hands=hands)
     calm, cleaned = without_noise(source)
     made, report = retarget(calm, target, mapping, config)
     write_clip(made, out)

@@ -93,6 +93,7 @@ def match_positions(
     targets: Mapping[int | str, np.ndarray],
     limbs: Mapping[int | str, Limb] | None = None,
     soft: float = SOFT,
+    fold: float = math.pi,
 ) -> np.ndarray:
     """The motion with hands and feet on their targets and all else kept: new `rot (T, J, 4)` wxyz.
 
@@ -105,6 +106,8 @@ def match_positions(
         targets: `(T, 3)` m world of each joint, by index or name; a NaN row leaves its frame free.
         limbs: which joints move a target, `limb_of` by default.
         soft: see `soft_reach`; a limb that the motion itself holds straighter may stay so.
+        fold: rad, bend of a knee or elbow beyond which none is bent that the motion itself does not bend
+            so far.
     """
     out = rot.copy()
     for joint, goal in targets.items():
@@ -113,7 +116,7 @@ def match_positions(
         now = pos[:, limb.end]
         goal = np.where(np.isfinite(goal).all(-1, keepdims=True), goal, now)
         hip, knee = pos[:, limb.root], pos[:, limb.mid]
-        bend, swing = _reach(hip, knee, now, goal, quat[:, limb.root], soft)
+        bend, swing = _reach(hip, knee, now, goal, quat[:, limb.root], soft, fold)
         _turn(skeleton, out, quat, limb, bend, swing)
     return normalize(out)
 
@@ -125,6 +128,7 @@ def _reach(
     goal: np.ndarray,
     upper_quat: np.ndarray,
     soft: float,
+    fold: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """World turns (wxyz) of the lower bone about the knee, then of the whole limb about its root."""
     u, v = root - mid, end - mid
@@ -132,6 +136,13 @@ def _reach(
     now, want = norm(end - root), norm(goal - root)
     # A limb that is straighter than the soft reach allows may stay as straight as it is.
     span = np.maximum(soft_reach(want, l1, l2, soft), np.minimum(want, now))
+    if fold < math.pi:
+        # The same at the other end, e exp((d - n - e) / e) below n + e for the nearest span n.
+        nearest = np.sqrt(np.maximum(l1**2 + l2**2 + 2 * l1 * l2 * math.cos(fold), 0.0))
+        ease = np.maximum(soft * (l1 + l2), 1e-12)
+        eased = nearest + ease * np.exp(np.minimum((span - nearest - ease) / ease, 0.0))
+        eased = np.where(span < nearest + ease, eased, span)
+        span = np.minimum(eased, np.maximum(span, now))
     axis, sine = _bend_axis(-u, v, upper_quat)
     span = now + _through_straight(sine) * (span - now)
     # |u - R v|^2 = d^2 gives A cos(delta) + B sin(delta) = (|u|^2 + |v|^2 - d^2) / 2 - C for R the turn

@@ -1,4 +1,6 @@
-"""Contacts carried over to another body: planted feet and hands stay planted, nothing sinks deeper."""
+"""Contacts carried over to another body: planted feet and hands stay planted, nothing sinks deeper.
+
+Hands may keep their places all the time, see `HandPlaces`."""
 
 from __future__ import annotations
 
@@ -11,6 +13,7 @@ from poise.body.topology import subtree
 from poise.kinematics.feet import TOUCH_M, contact_labels
 from poise.kinematics.forward import carried
 from poise.kinematics.limbs import Limb, match_positions
+from poise.kinematics.retargeting.hands import FOLDED, HandPlaces
 from poise.kinematics.retargeting.passage import Retargeter
 from poise.kinematics.retargeting.standing import ClipWorld
 from poise.motion import Clip
@@ -22,6 +25,10 @@ from poise.motion.smoothing import smooth_lift
 BLEND_S = 0.25
 #: Half the time (s) over which a lift is spread.
 LIFT_S = 0.05
+#: Rounds of hands that keep their places: each arm learns where the other one is.
+ROUNDS = 2
+#: See `limbs.soft_reach`: an arm that is too short for a place does not snap straight.
+SOFT_ARM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +45,11 @@ class Foot:
     limb: Limb
     tread_source: np.ndarray
     tread_target: np.ndarray
+
+    @property
+    def is_hand(self) -> bool:
+        """Whether it is the end of an arm."""
+        return self.name.endswith("hand")
 
     def points(self, pos: np.ndarray, quat: np.ndarray, target: bool) -> np.ndarray:
         """`(T, 3)` m, where the held point is."""
@@ -93,8 +105,10 @@ def plant(
     contacts: np.ndarray,
     hold: bool,
     clear: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """New local rotations `(T, J, 4)` and root path `(T, 3)` of the target with its contacts kept.
+    places: HandPlaces | None = None,
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """New local rotations `(T, J, 4)` and root path `(T, 3)` of the target with its contacts kept, and
+    `(T, 3)` m, where hands of `places` are to be, by their names.
 
     While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
     after scaling: what stood still stands still. Limbs that would then be under the floor by more than
@@ -117,28 +131,47 @@ def plant(
         up = np.zeros_like(root)
         up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
         root = root + up
+
+    def lifted(k: int, goal: np.ndarray, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+        """The place of an end, where it is no deeper than the source's."""
+        if not clear:
+            return goal
+        joint, up = feet[k].target, np.zeros_like(goal)
+        moved = pos + (goal - pos[:, joint])[:, None]
+        up[:, 2] = lift(moved, quat, subtree(skeleton, joint))
+        return goal + up
+
     pos, quat = skeleton.forward(root, rot)
     goals: dict[int | str, np.ndarray] = {}
+    hands = [k for k, foot in enumerate(feet) if foot.is_hand and places]
     for k, foot in enumerate(feet):
+        if k in hands:
+            continue
         goal = pos[:, foot.target]
         if hold:
             arm = quat_rotate(quat[:, foot.target], np.broadcast_to(foot.tread_target, (len(pos), 3)))
             wanted = scale.place(foot.points(*world, target=False)) - arm
             goal = goal + contact_weight(contacts[:, k], clip.fps)[:, None] * (wanted - goal)
-        if clear:
-            moved = pos + (goal - pos[:, foot.target])[:, None]
-            up = np.zeros_like(goal)
-            up[:, 2] = lift(moved, quat, subtree(skeleton, foot.target))
-            goal = goal + up
-        goals[foot.target] = goal
+        goals[foot.target] = lifted(k, goal, pos, quat)
     by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
     rot = match_positions(skeleton, rot, root, goals, by_end)
+    kept: dict[str, np.ndarray] = {}
+    for _ in range(ROUNDS if hands and places else 0):
+        assert places is not None
+        pos, quat = skeleton.forward(root, rot)
+        for k in hands:
+            foot, grounded = feet[k], contact_weight(contacts[:, k], clip.fps)
+            goal = places.of((foot.source, foot.target), foot.name.split()[0], pos, grounded)
+            kept[foot.name] = lifted(k, goal, pos, quat)
+        goals = {feet[k].target: kept[feet[k].name] for k in hands}
+        rot = match_positions(skeleton, rot, root, goals, by_end, soft=SOFT_ARM, fold=FOLDED)
     if clear:
         pos, quat = skeleton.forward(root, rot)
         up = np.zeros_like(root)
         up[:, 2] = lift(pos, quat, range(len(skeleton)))
         root = root + up
-    return rot, root
+        kept = {name: goal + up for name, goal in kept.items()}
+    return rot, root, kept
 
 
 def contact_weight(contact: np.ndarray, fps: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -28,7 +29,9 @@ class RetargetReport:
     the target and in the source. direction_deg, direction_max_deg: over all of them. trunk_deg: mean
     angle of the line from hips to shoulders.
     ends: per hand, foot and head the mean distance from where the source has it, seen from the hips, in
-    percent of the height of the hips. end_percent: over all of them.
+    percent of the height of the hips. end_percent: over all of them. hands_percent: mean and largest
+    distance of wrists from the places that they were to keep (`HandPlaces`), in percent of the height of
+    the hips; None where directions were kept.
     contact_s: seconds of foot contact, both feet together. slide_mm_s: mean horizontal speed of the feet
     in it, source (scaled to the target's size) and target. depth_mm: the deepest joint under the ground,
     mean over frames, source (scaled) and target; depth_max_mm likewise. seconds: time taken.
@@ -44,6 +47,7 @@ class RetargetReport:
     trunk_deg: float
     ends: tuple[tuple[str, float], ...]
     end_percent: float
+    hands_percent: tuple[float, float] | None
     contact_s: float
     slide_mm_s: tuple[float, float]
     depth_mm: tuple[float, float]
@@ -81,6 +85,12 @@ class RetargetReport:
             f"Hands, feet and head are {self.end_percent:.1f} % of the hips' height from where the "
             "source has them, seen from the hips.",
         ]
+        if self.hands_percent is not None:
+            mean, most = self.hands_percent
+            out.append(
+                f"Wrists are {mean:.1f} % of the hips' height from the places that they keep, "
+                f"{most:.0f} at most, in frames in which an arm is too short or would fold too far."
+            )
         if self.contact_s > 0:
             out.append(
                 f"Standing feet slide {self.slide_mm_s[1]:.0f} mm/s ({self.slide_mm_s[0]:.0f} in the "
@@ -108,9 +118,11 @@ def measure(
     passage: Retargeter,
     feet: tuple[Foot, ...],
     contacts: np.ndarray,
+    kept: Mapping[str, np.ndarray],
     seconds: float,
 ) -> RetargetReport:
-    """Measures what came of a retargeting; see `RetargetReport`. worlds: source and target."""
+    """Measures what came of a retargeting; see `RetargetReport`. worlds: source and target. kept: places
+    `(T, 3)` m of hands, by their names."""
     joints, scale, poses = passage.joints, passage.scale, (passage.here, passage.there)
     bones = _bones(joints, worlds[0].pos, worlds[1].pos)
     angles = np.concatenate([a for _, a in bones]) if bones else np.zeros(1)
@@ -134,6 +146,7 @@ def measure(
         float(np.abs(tilt).mean()),
         ends,
         float(np.mean([e for _, e in ends])) if ends else 0.0,
+        _kept(feet, kept, worlds[1].pos, poses[1].hip_height),
         held,
         slide,
         (float(depths[0].mean()), float(depths[1].mean())),
@@ -174,6 +187,16 @@ def _ends(passage: Retargeter, source: np.ndarray, target: np.ndarray) -> tuple[
             apart = norm(a[:, pair[0]] - b[:, pair[1]]).mean()
             out.append((role.replace("_", " "), float(apart) * 100))
     return tuple(out)
+
+
+def _kept(
+    feet: tuple[Foot, ...], kept: Mapping[str, np.ndarray], pos: np.ndarray, tall: float
+) -> tuple[float, float] | None:
+    if not kept:
+        return None
+    far = [norm(pos[:, foot.target] - kept[foot.name]) for foot in feet if foot.name in kept]
+    share = 100 * np.stack(far) / tall
+    return float(share.mean()), float(share.max())
 
 
 def _slide(

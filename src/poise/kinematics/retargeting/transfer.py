@@ -8,12 +8,13 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from poise.body.topology import subtree
 from poise.kinematics.retargeting.common_pose import common_pose
+from poise.kinematics.retargeting.hands import HandPlaces
 from poise.kinematics.retargeting.passage import Retargeter
 from poise.kinematics.retargeting.plant import feet_of, plant, source_contacts
 from poise.kinematics.retargeting.retarget_report import RetargetReport, measure
@@ -42,6 +43,9 @@ class RetargetConfig:
     heights of the hips. share: where the target's spine has more joints than the source's, they share
     its bend out; without, those that lie on a bone of the source move as that bone. rigid: roles that
     keep to what carries them.
+    hands: with "direction" arms point where the source's point, and hands end where arms of these
+    lengths take them; with "place" wrists are where the source's are, scaled, over the floor and from
+    the hips, or from the part of the body that they are near (`HandPlaces`), and elbows bend to it.
     """
 
     contacts: bool = True
@@ -49,6 +53,7 @@ class RetargetConfig:
     scale: float | None = None
     share: bool = True
     rigid: tuple[str, ...] = ()
+    hands: Literal["direction", "place"] = "direction"
 
 
 def retarget(
@@ -64,7 +69,7 @@ def retarget(
     W_target = W_source C_source^-1 C_target, so that bones of arms and legs point where they pointed.
     Spine and neck share their bend out along however many joints there are. The hips follow the source's
     path scaled by leg length about its start; then feet and hands are put back on the scaled contacts
-    (`plant`).
+    (`plant`), or hands on their places all the time (`RetargetConfig.hands`).
 
     Args:
         onto: the skeleton to move, or a clip on it, which also tells how it stands where its rest pose
@@ -88,15 +93,16 @@ def retarget(
     rot, root = passage.transfer(world)
     feet = feet_of(passage)
     contacts = source_contacts(clip, world, feet, passage.scale.ground)
-    if config.contacts or config.clear:
-        rot, root = plant(
-            *(clip, world, passage, rot, root, feet, contacts), hold=config.contacts, clear=config.clear
-        )
+    places = HandPlaces(passage, world, clip.fps, clip.cyclic) if config.hands == "place" else None
+    kept: dict[str, np.ndarray] = {}
+    if config.contacts or config.clear or places:
+        given = clip, world, passage, rot, root, feet, contacts
+        rot, root, kept = plant(*given, hold=config.contacts, clear=config.clear, places=places)
     flat = [unwrap_quats(normalize(rot[:, j])) for j in range(len(target))]
     made = Clip(target, root, np.stack(flat, 1), clip.fps, clip.name, clip.cyclic)
     seconds = time.perf_counter() - began
     worlds = world, ClipWorld.of(made)
-    return made, measure(worlds, clip.fps, passage, feet, contacts, seconds)
+    return made, measure(worlds, clip.fps, passage, feet, contacts, kept, seconds)
 
 
 _ARM = ("upper_arm", "forearm", "hand")
