@@ -144,6 +144,16 @@ def test_a_crash_loses_nothing_and_work_can_be_stopped(client: Client):
     client.send(type="run", take=walk["id"], action="body", values={"seed": 60})
     job = client.until(lambda s: next((j for j in s["jobs"] if j["share"] == 0.4), None))
     assert job["text"] == "looking ahead, 40 % done, 0:01 left"
+    # What is simulated so far can be seen, in whole rows, from any of them on.
+    client.until(lambda s: s["jobs"] and s["jobs"][0]["drawn"])
+    for row, firsts in ((0, [0, 1, 2]), (2, [2]), (7, [])):
+        where = f"http://{client.where}/drawn/{job['id']}/{row}?token=secret-word"
+        with urllib.request.urlopen(where, timeout=10) as got:
+            data = got.read()
+        assert json.loads(data[4:28]) == {"parents": [-1, 0]}
+        rows = np.frombuffer(data[28:], "<f4").reshape(-1, 7)
+        assert rows[:, 0].tolist() == firsts and (rows[:, 1] == 10 * rows[:, 0]).all()
+    assert _status(client, f"/drawn/{job['id']}/0") == 401
     client.send(type="stop", job=job["id"])
     assert client.event("stopped")["text"] == "Give it a body was stopped; nothing was changed."
     assert not [t for t in client.state["takes"] if t["action"] == "body"]
@@ -227,6 +237,8 @@ def test_strangers_are_kept_out(client: Client):
         "/figure/%2e%2e",
         f"/figure/{walk}/..",
         "/export/e999",
+        "/drawn/999/0",
+        "/drawn/1/../0",
         "/x",
     ):
         assert _status(client, f"{path}?{key}") == 404, path

@@ -157,6 +157,10 @@ def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: P
     assert "--keyframes 0,40,85" in page.until(f"{said}.includes('85') && {said}", 20)
     do(page, "between")
     page.until("document.body.dataset.busy === 'yes'")
+    # The stage shows what is simulated so far, and time goes along.
+    page.until("poiseOpen.state.made && poiseOpen.state.made[1] > 4", 200)
+    page.until("poiseOpen.state.frame > 2 && poiseOpen.state.frame < 85", 20)
+    assert "Between keys, so far" in page.js("document.getElementById('legend').textContent")
     press(page, " ")
     page.until("poiseOpen.state.playing")
     time.sleep(2.0)
@@ -166,6 +170,7 @@ def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: P
     page.js("document.querySelector('#jobs button').click()")
     page.until("document.body.dataset.busy === 'no'", 60)
     assert not [t for t in server.project.takes.values() if t.action == "between"]
+    page.until("poiseOpen.state.made === null")
     press(page, "k")
 
 

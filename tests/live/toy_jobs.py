@@ -24,6 +24,7 @@ def toy_work(argv: list[str], folder: Path) -> None:
     if fate == "9":
         os.kill(os.getpid(), signal.SIGKILL)
     if fate == "60":
+        draw(folder / "drawn.bin")
         time.sleep(60)
     motion = out if out.suffix else out / "simulated.bvh"
     motion.parent.mkdir(parents=True, exist_ok=True)
@@ -32,6 +33,13 @@ def toy_work(argv: list[str], folder: Path) -> None:
     told["notes"] = ["A note."]
     sys.stdout.write(json.dumps(told))
     sys.stdout.flush()
+
+
+def draw(path: Path) -> None:
+    """Three frames of two joints, and the beginning of a fourth."""
+    words = json.dumps({"parents": [-1, 0]}).encode().ljust(24)
+    rows = struct.pack("<21f", *(float(v) for k in range(3) for v in (k, *range(10 * k, 10 * k + 6))))
+    path.write_bytes(struct.pack("<I", len(words)) + words + rows + rows[:9])
 
 
 def toy_look(path: str, reading: dict[str, Any], room: str, folder: Path) -> None:

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 #: Modules that a job's process knows when it begins.
 VERBS = ("track", "push", "complete", "doctor", "convert", "retarget")
 PRELOAD = (
-    *("torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.jobs.track"),
+    *("torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.live.open.preview"),
+    "poise.jobs.track",
     *("poise.jobs.complete", *(f"poise.cli.{verb}" for verb in VERBS)),
 )
 #: The usual port.
@@ -139,10 +140,11 @@ def work(argv: list[str], folder: Path) -> None:
 
     from poise.cli import training
     from poise.cli.main import main
+    from poise.live.open.job_processes import DRAWN
 
     os.chdir(folder)
     Path("result").mkdir(exist_ok=True)
-    training.EVERY_S = PROGRESS_S
+    training.EVERY_S, training.DRAWS = PROGRESS_S, folder / DRAWN
     sys.exit(main([*argv, "--json"]))
 
 

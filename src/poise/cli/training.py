@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Seconds between two lines where there is no terminal.
 EVERY_S = 30.0
+#: A file into which what is simulated is written as it goes, for a page that shows it; None writes none.
+DRAWS: Path | None = None
 
 
 def clock(seconds: float) -> str:
@@ -129,7 +131,11 @@ def staged(shown: contextlib.ExitStack) -> Callable[[str, int, int], None]:
         share = done / max(of, 1)
         bar(share, f"{what}, {100 * share:.0f} % done, {left(time.monotonic() - began, share)}")
 
-    return show
+    if DRAWS is None:
+        return show
+    from poise.live.open.preview import Preview
+
+    return Preview(show, DRAWS)
 
 
 def held_already(out: Path) -> PoiseError:

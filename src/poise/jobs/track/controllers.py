@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
@@ -32,6 +34,25 @@ if TYPE_CHECKING:
 
 #: Is told what is done, and how many control steps of how many are done.
 Show = Callable[[str, int, int], None]
+
+
+@runtime_checkable
+class Draws(Protocol):
+    """A `Show` that draws the character as it is simulated."""
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        """See `Show`."""
+        ...
+
+    def begin(self, humanoid: Humanoid, placed: PlacedMotion, frames: int, rate_hz: float) -> None:
+        """Told of the body, of its motion, and of how many control steps at which rate are to come."""
+        ...
+
+    def draw(self, frame: int, qpos: np.ndarray) -> None:
+        """Told of a state `(7 + n)`; the frames of a new attempt begin anew."""
+        ...
+
+
 #: What is said where a policy cannot look ahead.
 NO_CRITIC = "The policy was saved without its critic, which lookahead needs; it acts without."
 
@@ -91,7 +112,8 @@ def done_by(
         if alone and not done.failures and loses(tracker, imitation):
             notes.append("The policy alone loses the motion.")
     else:
-        done = episode(imitation, config, tracker.policy, "policy")
+        # It takes moments; only who draws it is told.
+        done = episode(imitation, config, tracker.policy, "policy", draws_of(show))
     if config.searches and done.failures:
         how = replace(config.search, seed=config.seed)
         told = show and (lambda made, steps: show("searching", made, steps))
@@ -209,13 +231,12 @@ def episode(
         watch(env)
     keeper = ResetOnFail(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
-    told = (
-        [] if show is None else [StepProgress("looking ahead", int(task.reference.length[0]) - 1, show)]
-    )
+    what = "tracking" if controller == "policy" else "looking ahead"
+    told = [] if show is None else [StepProgress(what, int(task.reference.length[0]) - 1, show)]
     # The report shows one character.
     touched, states = ContactForces(), States()
     push = None if config.push is None else PushSeen()
-    observers = [*told, touched, states] if count == 1 else told
+    observers = [*told, *drawing(show), touched, states] if count == 1 else told
     observers += [] if push is None else [push]
     rollouts, recordings = run_episodes(
         lambda _: env, keeper or acts, every, starts, config.help_limit, 1, observers
@@ -243,6 +264,29 @@ class StepProgress:
         """Tells of control step `step`; it never needs more of them."""
         self.show(self.what, step, self.steps)
         return True
+
+
+class StepDrawing:
+    """Draws the first character at each control step of an episode that begins at frame `first`."""
+
+    def __init__(self, draws: Draws, first: int = 0):
+        self.draws, self.first = draws, first
+
+    def see(self, env: ImitationEnv, step: int) -> bool:
+        """Draws control step `step`; it never needs more of them."""
+        self.draws.draw(self.first + step, env.backend.state.qpos[0].detach().cpu().numpy())
+        return True
+
+
+def drawing(show: Show | None, first: int = 0) -> list[StepDrawing]:
+    """Who draws an episode from frame `first` on, if anybody does."""
+    draws = draws_of(show)
+    return [] if draws is None else [StepDrawing(draws, first)]
+
+
+def draws_of(show: Show | None) -> Draws | None:
+    """Who is told, if it draws."""
+    return show if isinstance(show, Draws) else None
 
 
 class ResetOnFail:

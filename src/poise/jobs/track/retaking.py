@@ -16,7 +16,7 @@ from poise.env.recovery.get_up import mixed
 from poise.errors import PoiseError
 from poise.formats import read_clip
 from poise.jobs.result import RULE, Result, Way
-from poise.jobs.track.controllers import Show, StepProgress, TrackingRun, episode, look_ahead
+from poise.jobs.track.controllers import Show, StepProgress, TrackingRun, drawing, episode, look_ahead
 from poise.jobs.track.recovery_run import ReplayActions
 from poise.jobs.track.simulation import FILE, Retake, Simulation, States
 from poise.jobs.track_settings import TrackConfig
@@ -164,7 +164,7 @@ def _take(
             acts.remember(0, goals.reference.poser(*_rows(before, max(0, first - PAST), first)).pos)
         seen, lost = States(), _Lost(first)
         told = [] if show is None else [StepProgress("looking ahead", stop - first, show)]
-        simulate(env, acts, obs, stop - first, seen, lost, *told)
+        simulate(env, acts, obs, stop - first, seen, lost, *told, *drawing(show, first))
     finally:
         env.close()
         if isinstance(acts, Lookahead):

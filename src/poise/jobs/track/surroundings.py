@@ -73,6 +73,14 @@ def at_home(supports: Sequence[Support], placed: PlacedMotion) -> tuple[Support,
     return _scaled(lowered, placed, 1.0 / placed.moved.scale if placed.moved else 1.0)
 
 
+def places_home(pos: np.ndarray, placed: PlacedMotion) -> np.ndarray:
+    """Places `(..., 3)` m in the body's world beside the motion on the skeleton that came in."""
+    scale = 1.0 / placed.moved.scale if placed.moved else 1.0
+    about = np.array([*placed.source.root_pos[0, :2], 0.0])
+    lowered = pos - np.array([0.0, 0.0, placed.report.clips[0].ground.lift_m])
+    return about + (lowered - about) * scale
+
+
 def write_supports(result: Result, out: Path, motion: Path, hold: bool) -> dict[str, Path]:
     """Writes what a motion rests on, beside the motion on the skeleton that came in: `supports.json`,
     which --support reads, and boxes in a GLB with the motion, its own file where that is one, else

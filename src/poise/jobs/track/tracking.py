@@ -29,7 +29,7 @@ from poise.jobs.deliver import settled as feet_settled
 from poise.jobs.open import Run, open_run
 from poise.jobs.result import RULE, Result, Way, needs_of
 from poise.jobs.runs import scored
-from poise.jobs.track.controllers import Show, TrackingRun, done_by, led_by
+from poise.jobs.track.controllers import Show, TrackingRun, done_by, draws_of, led_by
 from poise.jobs.track.in_place import InPlace, with_travel
 from poise.jobs.track.placement import (
     Clean,
@@ -185,6 +185,8 @@ class TrackSession:
         prices = config.direction.prices(
             self.given[0], imitation.humanoid.table, ref.frames, ref.rate_hz
         )
+        if (draws := draws_of(self.show)) is not None:
+            draws.begin(imitation.humanoid, self.placed[0], int(ref.length[0]), ref.rate_hz)
         do = self.do or done_by
         self.done, said = do(self.actor or tracker, imitation, config, hold, self.show, prices)
         notes, about, done = [*self.notes, *said], tracker.about, self.done

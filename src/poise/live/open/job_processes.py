@@ -24,18 +24,20 @@ LOOKS_S, STOPS_S = 0.1, 4.0
 TAIL = 2000
 _SHARE = re.compile(r"(\d+) % done")
 #: Files that a job writes into its folder.
-OUT, SAID = "out.json", "said.txt"
+OUT, SAID, DRAWN = "out.json", "said.txt", "drawn.bin"
 
 
 @dataclass(eq=False)
 class PageJob:
-    """A job: `run(*args, folder)` in a process, which writes `OUT` and `SAID` into its folder.
+    """A job: `run(*args, folder)` in a process, which writes `OUT` and `SAID` into its folder, and maybe
+    `DRAWN`, see `preview.Preview`.
 
     Attributes:
         state: waiting, running, stopping, done, stopped or crashed.
         code: the exit code.
         share: how much is done, 0 to 1; None where that is not known.
         text: the last line that it said.
+        drawn: bytes of what it has simulated so far.
     """
 
     id: int
@@ -49,6 +51,7 @@ class PageJob:
     code: int | None = None
     share: float | None = None
     text: str = ""
+    drawn: int = 0
     began: float = 0.0
     spent: float = 0.0
     process: Any = None
@@ -63,6 +66,7 @@ class PageJob:
             "state": self.state,
             "share": self.share,
             "text": self.text,
+            "drawn": self.drawn,
             "seconds": round(now - self.began, 1) if self.began else 0.0,
             **self.about,
         }
@@ -74,6 +78,18 @@ class PageJob:
         except (OSError, ValueError, RecursionError):
             return {}
         return held if isinstance(held, dict) else {}
+
+
+def drawn_since(path: Path, row: int) -> bytes:
+    """What a job has simulated, see `preview.Preview`: the header, and the rows from one on."""
+    with path.open("rb") as file:
+        first = file.read(4)
+        words = file.read(int.from_bytes(first, "little"))
+        size = 4 * (1 + 3 * len(json.loads(words)["parents"]))
+        file.seek(row * size, os.SEEK_CUR)
+        rows = file.read()
+    # The last one may be half written.
+    return first + words + rows[: len(rows) - len(rows) % size]
 
 
 class Workers:
@@ -190,8 +206,10 @@ class Workers:
         job.process.start()
 
     def _progress(self, job: PageJob) -> bool:
-        before = job.text, job.share, job.state, int(time.monotonic() - job.began)
+        before = job.text, job.share, job.state, int(time.monotonic() - job.began), job.drawn
         job.text, job.share = _said(job.folder / SAID, job.text, job.share)
+        with contextlib.suppress(OSError):
+            job.drawn = (job.folder / DRAWN).stat().st_size
         if job.state == "stopping" and time.monotonic() - job.asked > STOPS_S:
             job.process.kill()
         if not job.process.is_alive():
@@ -200,7 +218,7 @@ class Workers:
             ended = "crashed" if (job.code or 0) < 0 else "done"
             self._over(job, "stopped" if job.state == "stopping" else ended)
             return True
-        return before != (job.text, job.share, job.state, int(job.told()["seconds"]))
+        return before != (job.text, job.share, job.state, int(job.told()["seconds"]), job.drawn)
 
     def _over(self, job: PageJob, state: str) -> None:
         job.state, job.spent = state, time.monotonic() - job.began if job.began else 0.0

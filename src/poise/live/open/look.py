@@ -44,10 +44,7 @@ def figure_of(clip: Clip) -> bytes:
     """A clip to draw: the length of a header as four bytes, little-endian, the header as JSON, blanks up
     to a multiple of four, and places `(T, J, 3)` as float32, m, Z up, of joints and, after them, of bone
     tips."""
-    skeleton = clip.skeleton
-    pos, quat = clip.world()
-    tips = [(j, np.array(end)) for j, end in skeleton.ends if np.linalg.norm(end) > 1e-6]
-    pos = np.concatenate([pos, *(_carried(pos[:, j], quat[:, j], end)[:, None] for j, end in tips)], 1)
+    skeleton, tips, pos = clip.skeleton, _tips(clip), places_of(clip)
     step = math.ceil(pos.size * 4 / MOST_BYTES)
     roles = {r.joint: r for r in find_roles(skeleton).rows}
     tall = min(max(standing_height(clip)[0] / TALL_M, 1e-3), 1e3)
@@ -79,9 +76,25 @@ def figure_of(clip: Clip) -> bytes:
         "home": home_suffix(clip),
         **{k: v for k, v in describe(clip).items() if k in ("format", "unit_m", "up_axis", "height_m")},
     }
+    return headed(header) + pos[::step].astype("<f4").tobytes()
+
+
+def headed(header: dict[str, Any]) -> bytes:
+    """The header of what is drawn: see `figure_of`."""
     words = json.dumps(plain(header)).encode()
     words += b" " * (-len(words) % 4)
-    return struct.pack("<I", len(words)) + words + pos[::step].astype("<f4").tobytes()
+    return struct.pack("<I", len(words)) + words
+
+
+def places_of(clip: Clip) -> np.ndarray:
+    """Places `(T, J, 3)` m, Z up, of joints and, after them, of bone tips."""
+    pos, quat = clip.world()
+    tips = (_carried(pos[:, j], quat[:, j], end)[:, None] for j, end in _tips(clip))
+    return np.concatenate([pos, *tips], 1)
+
+
+def _tips(clip: Clip) -> list[tuple[int, np.ndarray]]:
+    return [(j, np.array(end)) for j, end in clip.skeleton.ends if np.linalg.norm(end) > 1e-6]
 
 
 def _sided(roles: dict[int, Any], joint: int) -> bool:

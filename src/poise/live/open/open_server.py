@@ -32,7 +32,7 @@ from poise.live.open.actions import (
     words_of,
 )
 from poise.live.open.answers import motion_of, problem_of, sentences
-from poise.live.open.job_processes import PageJob, Workers
+from poise.live.open.job_processes import DRAWN, PageJob, Workers, drawn_since
 from poise.live.open.project import LARGEST, Project, ProjectTake, clean_name, safe_file, write_json
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, Content, WebServer
 
@@ -58,6 +58,8 @@ _REPORT = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
 )
 _FETCHED = re.compile(r"/(figure|judged|report|export)/([0-9a-z]{1,16})")
+#: What a job has simulated so far, from a row on.
+_DRAWN = re.compile(r"/drawn/([0-9]{1,9})/([0-9]{1,9})")
 
 
 @dataclass(frozen=True)
@@ -275,7 +277,9 @@ class OpenServer:
             return 0
 
     def _fetch(self, path: str) -> Content | None:
-        """A file of a take or an export, by its number alone."""
+        """A file of a take or a job or an export, by its number alone."""
+        if drawn := _DRAWN.fullmatch(path):
+            return self._drawn(*map(int, drawn.groups()))
         found = _FETCHED.fullmatch(path)
         if found is None:
             return None
@@ -294,6 +298,15 @@ class OpenServer:
                 return Content((room / "judged.json").read_bytes(), "application/json")
             report = self.project.folder / take.result / "report.html"
             return Content(report.read_bytes(), HTML, policy=_REPORT) if take.result else None
+        return None
+
+    def _drawn(self, number: int, row: int) -> Content | None:
+        job = self.workers.jobs.get(number)
+        # A job that ends takes its file with it.
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            if job is not None:
+                data = drawn_since(job.folder / DRAWN, row)
+                return Content(data, "application/octet-stream")
         return None
 
     # --- doors --------------------------------------------------------------------------------

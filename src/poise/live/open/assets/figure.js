@@ -52,6 +52,45 @@ function decodeFigure(buffer) {
     },
   };
 }
+// What a job has simulated so far: the same, of frames that come one after another.
+function growingFigure() {
+  let head = null, data = null, J = 0, have = null, low = Infinity, high = -1;
+  const figure = {
+    rows: 0,
+    get ready() { return high >= low; },
+    get first() { return low; },
+    get last() { return high; },
+    add(buffer) {
+      const size = new DataView(buffer).getUint32(0, true);
+      if (!head) {
+        head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+        J = head.parents.length;
+        Object.assign(figure, head, { J });
+        data = new Float32Array(3 * J * head.frames);
+        have = new Int32Array(head.frames).fill(-1);
+      }
+      const rows = new Float32Array(buffer, 4 + size), width = 1 + 3 * J;
+      for (let r = 0; r + width <= rows.length; r += width) {
+        const frame = rows[r];
+        if (!(frame >= 0 && frame < head.frames)) continue;
+        data.set(rows.subarray(r + 1, r + width), 3 * J * frame);
+        have[frame] = frame;
+        low = Math.min(low, frame);
+        // A new attempt begins anew.
+        high = frame;
+      }
+      figure.rows += Math.floor(rows.length / width);
+      // A frame that was left out shows the one before.
+      for (let f = low, at = low; f <= high; f++) { if (have[f] === f) at = f; else have[f] = at; }
+    },
+    at(frame, out) {
+      const f = have[Math.min(Math.max(Math.round(frame), low), high)];
+      out.set(data.subarray(3 * J * f, 3 * J * (f + 1)));
+      return out;
+    },
+  };
+  return figure;
+}
 // Colours of faults by their kind.
 const FAULTS = {
   "foot slide": "#d9480f", float: "#1c7ed6", penetration: "#862e9c", jitter: "#e8a400", "root jitter": "#e8a400", tremble: "#e8a400",

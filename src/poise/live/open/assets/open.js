@@ -5,7 +5,7 @@
   const V = 1;
   let socket = null, hello = null, project = null, view = null, line = null, forms = null, wait = 400;
   let frame = 0, playing = 0, last = performance.now(), fault = -1, range = null, seen = null, joint = null, redo = [];
-  let opened = null, drag = null, compare = "", asked = "", drawn = [], dirty = true;
+  let opened = null, drag = null, compare = "", asked = "", drawn = [], dirty = true, growing = null;
   const motions = new Map(), kept = new Map();
   const token = new URLSearchParams(location.search).get("token");
   // The browser keeps it as a cookie; the address need not show it.
@@ -77,6 +77,7 @@
     if (!before || before.current !== project.current) changed(before ? before.current : "");
     list();
     jobs();
+    grow();
     beside();
     if (!motion()) judgements();
   }
@@ -151,7 +152,7 @@
   }
   function arrived(kind) {
     const m = motion();
-    if (view) view.show(m, motion(compare));
+    if (view) stage();
     if (!m) { line.show(null); judgements(); said(); return; }
     frame = Math.min(frame, m.frames - 1);
     if (joint === null || !m.names.includes(joint)) {
@@ -188,6 +189,7 @@
     line.show({
       frames: m.frames, fps: m.fps, frame, faults: j ? j.faults : [], contacts: j ? j.contacts : [], fault, range, curves,
       keys: opened && opened.values.keyframes ? opened.values.keyframes : [], unit: axis === "speed" ? "m/s" : "m",
+      made: made() ? [toMotion(made(), made().first), toMotion(made(), made().last)] : null,
     });
   }
   function list() {
@@ -244,16 +246,40 @@
     document.body.dataset.busy = work.length ? "yes" : "no";
     for (const form of forms.values()) form.run.disabled = !motion();
   }
+  // What the job on the motion that is shown has simulated so far comes in parts, and is shown over it.
+  async function grow() {
+    const job = project.jobs.find((j) => j.lane === "work" && j.take === current() && j.drawn);
+    if (growing && (!job || job.id !== growing.job)) { growing = null; timeline(); }
+    if (!job || (growing && growing.busy)) return;
+    if (!growing) growing = { job: job.id, figure: growingFigure(), size: 0, led: !playing, busy: false };
+    const mine = growing;
+    if (job.drawn === mine.size) return;
+    mine.busy = true;
+    mine.size = job.drawn;
+    try {
+      const got = await fetch(`/drawn/${job.id}/${mine.figure.rows}`);
+      if (got.ok) mine.figure.add(await got.arrayBuffer());
+    } catch (error) { /* The job ended meanwhile. */ }
+    setTimeout(() => { mine.busy = false; if (mine === growing) grow(); }, 250);
+    if (mine !== growing || !mine.figure.ready || !motion()) return;
+    beside();
+    // Time goes along with the work until somebody takes it.
+    if (mine.led && !playing) { mine.at = toMotion(mine.figure, mine.figure.last); seek(mine.at); }
+    timeline();
+  }
+  const toMotion = (of, at) => (at / of.fps) * motion().fps;
   function beside() {
     const options = [["", "nothing"], ...project.takes.filter((t) => t.id !== project.current).map((t) => [t.id, t.name])];
-    const words = JSON.stringify([options, compare]);
+    const job = made() && project.jobs.find((j) => j.id === growing.job);
+    const words = JSON.stringify([options, compare, job && job.id]);
     if ($("beside").dataset.words === words) return;
     $("beside").dataset.words = words;
     $("beside").replaceChildren(...options.map(([value, text]) => new Option(text, value)));
     $("beside").value = compare;
     $("legend").replaceChildren();
-    if (compare && take(compare) && take()) {
-      const mark = (color, text) => { const b = make("b"); b.style.background = `var(${color})`; return make("span", {}, b, text); };
+    const mark = (color, text) => { const b = make("b"); b.style.background = `var(${color})`; return make("span", {}, b, text); };
+    if (job) $("legend").append(mark("--sim", `${job.label}, so far`), mark("--ref", take().name));
+    else if (compare && take(compare) && take()) {
       $("legend").append(mark("--sim", take().name), mark("--ref", take(compare).name));
     }
   }
@@ -365,6 +391,7 @@
   function seek(to) {
     const m = motion();
     if (!m) return;
+    if (growing && to !== growing.at) growing.led = false;
     frame = Math.min(Math.max(to, 0), m.frames - 1);
     const moment = `frame ${Math.round(frame)} of ${m.frames - 1}, ${(frame / m.fps).toFixed(2)} s`;
     $("time").textContent = moment;
@@ -390,6 +417,7 @@
     timeline();
     if (opened) askLine(opened);
   }
+  const made = () => (growing && growing.figure.ready && motion() ? growing.figure : null);
   function goFault(k) {
     const j = judged(), m = motion();
     if (!j || !j.faults[k]) return;
@@ -405,6 +433,12 @@
   }
   // Pictures are drawn where something changed, so that jobs have the machine.
   const touch = () => { dirty = true; };
+  // Which motions stand there; the one that is being made, if any.
+  function stage() {
+    const off = $("mode").value === "off", live = off ? null : made();
+    view.show(motion(), live || off ? null : motion(compare), live);
+    return live;
+  }
   function draw(now) {
     requestAnimationFrame(draw);
     const m = motion(), spent = Math.min((now - last) / 1000, 0.25);
@@ -420,9 +454,10 @@
     if (!dirty && !playing) return;
     dirty = false;
     const other = motion(compare), mode = $("mode").value;
-    view.show(m, mode === "off" ? null : other);
+    const live = stage();
     const b = m && other ? Math.min((frame / m.fps) * other.fps, other.frames - 1) : 0;
-    view.draw({ a: frame, b, shift: mode === "side" ? 1.3 : 0, follow: $("follow").checked, marks });
+    const c = m && live ? (frame / m.fps) * live.fps : 0;
+    view.draw({ a: frame, b, c, shift: mode === "side" ? 1.3 : 0, follow: $("follow").checked, marks });
     drawn.push(now);
     while (drawn[0] < now - 1000) drawn.shift();
     document.body.dataset.drawn = drawn.length;
@@ -784,7 +819,7 @@
   });
 
   window.poiseOpen = {
-    get state() { return { frame, playing, current: current(), compare, joint, range, fault, project, motion: motion(), judged: judged() }; },
+    get state() { return { frame, playing, current: current(), compare, joint, range, fault, project, made: made() && [made().first, made().last], motion: motion(), judged: judged() }; },
     seek, screen: (j) => view.screen(view.places[3 * j], view.places[3 * j + 1], view.places[3 * j + 2]), forms: () => forms,
   };
   connect();

@@ -12,7 +12,7 @@ function stageView(host, over) {
   const materials = () => ["", "left", "right"].map(() => new T.MeshStandardMaterial({ roughness: 0.6 }));
   const ghostly = () => ["", "left", "right"].map(() => new T.MeshBasicMaterial({ transparent: true, opacity: 0.34, depthWrite: false }));
   const wood = new T.MeshStandardMaterial({ roughness: 0.9 });
-  const shown = { a: null, b: null };
+  const shown = { a: null, b: null, c: null };
   let boxes = [], target = new T.Vector3(0, 0, 0.9), placed = false, moved = new T.Vector3();
 
   // A figure of bones as capsules, and a head.
@@ -78,7 +78,7 @@ function stageView(host, over) {
     theme() {
       base.theme("--bg");
       wood.color.set(css("--thing"));
-      for (const who of [shown.a, shown.b])
+      for (const who of [shown.a, shown.b, shown.c])
         if (who) (who.ghost ? ["--ref", "--ref", "--rim"] : ["--sim", "--left", "--right"]).forEach((name, k) => who.mats[k].color.set(css(name)));
     },
     resize() {
@@ -89,12 +89,12 @@ function stageView(host, over) {
       over.height = h * ratio;
       ink.setTransform(ratio, 0, 0, ratio, 0, 0);
     },
-    // Which motions are shown; the second one is the ghost.
-    show(a, b) {
-      for (const [name, motion] of [["a", a], ["b", b]]) {
-        if (shown[name] && shown[name].motion === motion) continue;
+    // Which motions are shown; the second one is a ghost, and so is the first beside what is being made.
+    show(a, b, c = null) {
+      for (const [name, motion, ghost] of [["a", a, Boolean(c)], ["b", b, true], ["c", c, false]]) {
+        if (shown[name] ? shown[name].motion === motion && shown[name].ghost === ghost : !motion) continue;
         drop(shown[name]);
-        shown[name] = motion ? figure(motion, name === "b") : null;
+        shown[name] = motion ? figure(motion, ghost) : null;
       }
       view.theme();
     },
@@ -117,7 +117,7 @@ function stageView(host, over) {
       });
     },
     // frames: of each motion. shift: m across the view between them. marks: draws over the picture.
-    draw({ a, b, shift, follow, marks }) {
+    draw({ a, b, c, shift, follow, marks }) {
       if (!shown.a) return base.render();
       const root = shown.a.motion;
       pose(shown.a, a, 0, 0);
@@ -127,6 +127,7 @@ function stageView(host, over) {
       const across = [camera.position.y - controls.target.y, controls.target.x - camera.position.x];
       const n = Math.hypot(...across) || 1;
       if (shown.b) pose(shown.b, b, shift * across[0] / -n, shift * across[1] / -n);
+      if (shown.c) pose(shown.c, c, 0, 0);
       if (!placed) {
         target.set(...wanted);
         const { low, high } = root.bounds();

@@ -40,6 +40,11 @@ function timelineView(canvas, acts) {
       ink.fillRect(a - 1, 0, 2, h);
       ink.fillRect(b - 1, 0, 2, h);
     }
+    // What is simulated so far.
+    if (state.made) {
+      ink.fillStyle = css("--sim");
+      ink.fillRect(toX(state.made[0]), RULER - 4, Math.max(toX(state.made[1]) - toX(state.made[0]), 2), 3);
+    }
     const shownFrames = span[1] - span[0];
     const steps = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 50000];
     const step = steps.find((s) => (s / shownFrames) * wide() > 58) || 100000;
