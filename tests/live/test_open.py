@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import socket
 import struct
+import subprocess
+import sys
+import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -28,6 +33,7 @@ from poise.formats import read_clip
 from poise.live.admission import Guard
 from poise.live.open.actions import ACTIONS, EXPORTS, reading_of, reading_words, words_of
 from poise.live.open.answers import sentences
+from poise.live.open.job_processes import PageJob, Workers
 from poise.live.open.look import figure_of, judged
 from poise.live.open.open_server import PAGES, OpenServer, Runs
 from poise.live.open.project import LARGEST, Project, safe_file
@@ -293,6 +299,61 @@ def test_a_project_opens_again(tmp_path: Path):
     (tmp_path / "project.json").write_text("[]")
     with refused("not-a-project"):
         Project(tmp_path)
+
+
+def test_a_process_waits_for_work_and_what_is_light_needs_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("poise.live.open.job_processes.IDLE_S", 0.0)
+    told, over = list[PageJob](), threading.Event()
+
+    def ended(job: PageJob) -> None:
+        told.append(job)
+        over.set()
+
+    workers = Workers(tmp_path, (), lambda: None, lambda *_: None, ("json", "no_such_module"))
+    try:
+        ids = list[int]()
+        for number in range(2):
+            end = time.monotonic() + 20
+            while workers._spare is None and time.monotonic() < end:
+                time.sleep(0.02)
+            assert workers._spare is not None
+            ids.append(workers._spare[0].pid)
+            over.clear()
+            argv = ["track", "-o", "result", *(("--seed", "9") if number else ())]
+            workers.submit("work", toy_work, (argv,), ended)
+            assert over.wait(20)
+        # One that was killed took nothing with it; both ran where somebody waited.
+        assert [(j.state, j.code) for j in told] == [("done", 0), ("crashed", -9)]
+        assert len(set(ids)) == 2
+        assert not any(_lives(number) for number in ids)
+        while workers._spare is None:
+            time.sleep(0.02)
+        last = workers._spare[0].pid
+        assert _lives(last)
+    finally:
+        workers.close()
+    assert not _lives(last)
+
+
+def _lives(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_file_is_looked_at_without_torch(tmp_path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path; from poise.cli.open import look; import importlib; "
+        "from poise.cli.open import PRELOAD; [importlib.import_module(m) for m in PRELOAD]; "
+        f"look({str(WALK)!r}, {{}}, {str(tmp_path)!r}, Path({str(tmp_path)!r})); "
+        "assert not {'torch', 'mujoco'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60, stdout=subprocess.DEVNULL)
+    assert (tmp_path / "figure.bin").exists() and (tmp_path / "judged.json").exists()
 
 
 def _options(made: Callable[..., Any]) -> Iterator[tuple[str, Any]]:

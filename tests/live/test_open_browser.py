@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from chromium import CHROMIUM, Page, opened
 
-from poise.cli.open import PRELOAD, look, rests, work
+from poise.cli.open import HEAVY, PRELOAD, look, rests, work
 from poise.formats import read_clip, write_clip
 from poise.live.admission import Guard
 from poise.live.open.open_server import OpenServer, Runs
@@ -36,7 +36,9 @@ READY = (
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenServer]:
     folder = tmp_path_factory.mktemp("animator") / "project"
-    out = OpenServer(Project(folder), Guard("127.0.0.1", 0, "word"), Runs(work, look, rests, PRELOAD))
+    out = OpenServer(
+        Project(folder), Guard("127.0.0.1", 0, "word"), Runs(work, look, rests, PRELOAD, HEAVY)
+    )
     yield out
     out.close()
 

@@ -25,12 +25,14 @@ from poise.errors import PoiseError
 if TYPE_CHECKING:
     from poise.motion import Clip
 
-#: Modules that a job's process knows when it begins.
-VERBS = ("track", "push", "complete", "doctor", "convert", "retarget")
+#: Modules that a job's process knows when it begins, and those that simulations need besides.
 PRELOAD = (
-    *("torch", "mujoco", "poise.cli.main", "poise.live.open.look", "poise.live.open.preview"),
-    "poise.jobs.track",
-    *("poise.jobs.complete", *(f"poise.cli.{verb}" for verb in VERBS)),
+    *("poise.cli.main", "poise.cli.options", "poise.live.open.look"),
+    *(f"poise.cli.{verb}" for verb in ("doctor", "convert", "retarget")),
+)
+HEAVY = (
+    *("torch", "mujoco", "poise.jobs.track", "poise.jobs.complete", "poise.live.open.preview"),
+    *(f"poise.cli.{verb}" for verb in ("track", "push", "complete")),
 )
 #: The usual port.
 PORT = 8018
@@ -80,7 +82,7 @@ def run(
             raise PoiseError(what, path, "Name motion files", code="file-missing")
     held = Project(project)
     guard = Guard(host, _free(host, port), secrets.token_urlsafe(24))
-    server = OpenServer(held, guard, Runs(work, look, rests, PRELOAD))
+    server = OpenServer(held, guard, Runs(work, look, rests, PRELOAD, HEAVY))
     try:
         for path in reversed(clips):
             server.add_file(path, reading=stated(reading))
@@ -164,8 +166,10 @@ def rests(path: str, reading: dict[str, Any], folder: Path) -> None:
     """A job: what a motion rests on."""
 
     def made() -> dict[str, Any]:
+        from poise.cli.main import share_cores
         from poise.live.open.look import rests_of
 
+        share_cores()
         tell("looking what it rests on")
         return {"boxes": rests_of(_read(path, reading))}
 
@@ -174,9 +178,6 @@ def rests(path: str, reading: dict[str, Any], folder: Path) -> None:
 
 def _answered(made: Any) -> None:
     """Writes what was made, or why it was not, as JSON."""
-    from poise.cli.main import share_cores
-
-    share_cores()
     try:
         answer: dict[str, Any] = {"ok": True, **made()}
     except (KeyboardInterrupt, Exception) as problem:

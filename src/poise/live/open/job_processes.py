@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import multiprocessing
 import os
@@ -20,6 +21,8 @@ from typing import Any
 LANES = {"look": 1, "work": 1}
 #: s between looks at the processes; s that a job gets to stop by itself.
 LOOKS_S, STOPS_S = 0.1, 4.0
+#: s without a job after which a spare process prepares for the next one.
+IDLE_S = 1.5
 #: Bytes of progress that are looked at.
 TAIL = 2000
 _SHARE = re.compile(r"(\d+) % done")
@@ -98,6 +101,8 @@ class Workers:
     Args:
         folder: where each job has one of its own.
         preload: modules that a process knows when a job begins, which saves their import.
+        heavy: modules that take seconds to import. While nothing runs, a spare process imports them for
+            the next job of the lane "work", so that what is light need not wait for it.
         changed: is told, in the thread of the workers, that jobs are further than before.
         broke: is told of a fault in what a job's end did.
     """
@@ -108,6 +113,7 @@ class Workers:
         preload: Sequence[str],
         changed: Callable[[], None],
         broke: Callable[[PageJob, Exception], None],
+        heavy: Sequence[str] = (),
     ):
         self._folder, self._changed, self._broke = folder, changed, broke
         forks = "forkserver" in multiprocessing.get_all_start_methods()
@@ -117,6 +123,9 @@ class Workers:
         self.jobs: dict[int, PageJob] = {}
         self._count, self._stop, self._lock = 0, threading.Event(), threading.RLock()
         self._wake = threading.Event()
+        self._heavy, self._idle = tuple(heavy), time.monotonic()
+        #: The process that waits for work, and the end of a pipe that gives it.
+        self._spare: tuple[Any, Any] | None = None
         self._thread = threading.Thread(target=self._mind, daemon=True)
         self._thread.start()
 
@@ -164,6 +173,11 @@ class Workers:
                     job.process.kill()
                     job.process.join(2.0)
                 shutil.rmtree(job.folder, ignore_errors=True)
+            if self._spare is not None:
+                process, gives = self._spare
+                gives.close()
+                process.kill()
+                process.join(2.0)
 
     def told(self) -> list[dict[str, Any]]:
         """Jobs that wait or run, for the page."""
@@ -186,6 +200,10 @@ class Workers:
         new = False
         with self._lock:
             jobs = list(self.jobs.values())
+        if jobs:
+            self._idle = time.monotonic()
+        elif self._heavy and self._spare is None and time.monotonic() - self._idle > IDLE_S:
+            self._spare = self._waiting()
         for job in jobs:
             if job.state in ("running", "stopping"):
                 new |= self._progress(job)
@@ -200,10 +218,25 @@ class Workers:
         return sum(j.lane == lane for j in busy) < LANES[lane]
 
     def _start(self, job: PageJob) -> None:
-        job.process = self._context.Process(target=_begin, args=(job.run, job.args, str(job.folder)))
+        given = job.run, job.args, str(job.folder)
         job.began, job.state = time.monotonic(), "running"
+        if job.lane == "work" and self._spare is not None:
+            (job.process, gives), self._spare = self._spare, None
+            with contextlib.suppress(OSError):
+                gives.send(given)
+                gives.close()
+                return
+        job.process = self._context.Process(target=_begin, args=given)
         # The first start waits until what is preloaded is there.
         job.process.start()
+
+    def _waiting(self) -> tuple[Any, Any]:
+        """A process that imports what is heavy, and waits for work."""
+        takes, gives = self._context.Pipe(duplex=False)
+        process = self._context.Process(target=_wait, args=(takes, self._heavy))
+        process.start()
+        takes.close()
+        return process, gives
 
     def _progress(self, job: PageJob) -> bool:
         before = job.text, job.share, job.state, int(time.monotonic() - job.began), job.drawn
@@ -250,6 +283,22 @@ def _said(path: Path, text: str, share: float | None) -> tuple[str, float | None
     if found:
         return last[:200], int(found[1]) / 100
     return last[:200], share if last == text else None
+
+
+def _wait(takes: Any, heavy: Sequence[str]) -> None:
+    """The process that waits for work; it ends when nobody is left to give any."""
+    # Ctrl-C is for the server, which ends this.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in heavy:
+        # Who needs it says what is wrong with it.
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
+    try:
+        given = takes.recv()
+    except (EOFError, OSError):
+        return
+    takes.close()
+    _begin(*given)
 
 
 def _begin(run: Callable[..., None], args: tuple[Any, ...], folder: str) -> None:

@@ -70,13 +70,14 @@ class Runs:
         work: a command line; its JSON goes to stdout.
         look: (file, reading, folder): writes what the page draws, see `look`.
         rests: (file, reading): writes what the motion rests on, as JSON to stdout.
-        preload: modules that a process knows when it begins.
+        preload: modules that a process knows when it begins. heavy: those of simulations, see `Workers`.
     """
 
     work: Callable[..., None]
     look: Callable[..., None]
     rests: Callable[..., None]
     preload: tuple[str, ...] = ()
+    heavy: tuple[str, ...] = ()
 
 
 class OpenServer:
@@ -102,7 +103,7 @@ class OpenServer:
         self._fresh: asyncio.Event | None = None
         self._jobs = project.folder / ".jobs"
         shutil.rmtree(self._jobs, ignore_errors=True)
-        self.workers = Workers(self._jobs, runs.preload, self._changed, self._broke)
+        self.workers = Workers(self._jobs, runs.preload, self._changed, self._broke, runs.heavy)
         doors = {"/open": self._talk, "/upload": self._upload}
         self._web = WebServer(guard, PAGES, doors, PART, self._ready, self._fetch)
         for take in project.takes.values():
