@@ -37,6 +37,7 @@ from poise.live.open.job_processes import PageJob, Workers
 from poise.live.open.look import figure_of, judged
 from poise.live.open.open_server import PAGES, OpenServer, Runs
 from poise.live.open.project import LARGEST, Project, safe_file
+from poise.live.open.project_lock import LOCK, ProjectLock
 from refusals import refused
 from test_docs import WALK
 
@@ -354,6 +355,46 @@ def test_a_file_is_looked_at_without_torch(tmp_path: Path) -> None:
     )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60, stdout=subprocess.DEVNULL)
     assert (tmp_path / "figure.bin").exists() and (tmp_path / "judged.json").exists()
+
+
+def test_a_project_has_one_page_at_a_time(tmp_path: Path) -> None:
+    with serving(tmp_path) as client:
+        address = f"http://{client.where}/"
+        job = tmp_path / ".jobs" / "kept"
+        job.mkdir(parents=True)
+        with refused("project-in-use", says=("is open already", f"process {os.getpid()}", address)):
+            OpenServer(
+                Project(tmp_path), Guard("127.0.0.1", 0, "w"), Runs(toy_work, toy_look, toy_rests)
+            )
+        # Nothing of the first one's was touched.
+        assert job.exists() and client.upload("walk.bvh", b"HIERARCHY")["type"] == "took"
+    assert not (tmp_path / LOCK).exists()
+    # A process that was killed holds nobody off, whatever its file says.
+    script = (
+        "import os, sys; from pathlib import Path; from poise.live.open.project_lock import ProjectLock; "
+        f"lock = ProjectLock(Path({str(tmp_path)!r})); print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "held\n"
+        with refused("project-in-use", says=(f"process {other.pid}",)):
+            ProjectLock(tmp_path)
+        other.kill()
+        other.wait(10)
+    assert json.loads((tmp_path / LOCK).read_text())["process"] == other.pid
+    with serving(tmp_path) as client:
+        assert client.take("walk")
+        assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+
+
+def test_a_port_that_is_taken_leaves_the_project_free(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        guard = Guard("127.0.0.1", taken.getsockname()[1], "w")
+        with refused("cannot-listen"):
+            OpenServer(Project(tmp_path), guard, Runs(toy_work, toy_look, toy_rests))
+    with serving(tmp_path) as client:
+        assert client.state["takes"] == []
 
 
 def _options(made: Callable[..., Any]) -> Iterator[tuple[str, Any]]:

@@ -34,6 +34,7 @@ from poise.live.open.actions import (
 from poise.live.open.answers import motion_of, problem_of, sentences
 from poise.live.open.job_processes import DRAWN, PageJob, Workers, drawn_since
 from poise.live.open.project import LARGEST, Project, ProjectTake, clean_name, safe_file, write_json
+from poise.live.open.project_lock import ProjectLock
 from poise.live.page.web import CSS, HTML, JS, STAGE, TOLD, Asset, Content, WebServer
 
 SCRIPTS = ("figure", "stage_view", "timeline", "forms", "open")
@@ -89,10 +90,12 @@ class OpenServer:
         runs: what runs elsewhere.
 
     Raises:
-        PoiseError: the address is taken or is none of this machine.
+        PoiseError: another page has the project; or the address is taken or is none of this machine.
     """
 
     def __init__(self, project: Project, guard: Guard, runs: Runs):
+        # What a job of another page writes would be taken away below.
+        self._lock = ProjectLock(project.folder)
         self.project, self.guard, self._runs = project, guard, runs
         self._events: list[dict[str, Any]] = []
         self._event_count = 0
@@ -105,7 +108,13 @@ class OpenServer:
         shutil.rmtree(self._jobs, ignore_errors=True)
         self.workers = Workers(self._jobs, runs.preload, self._changed, self._broke, runs.heavy)
         doors = {"/open": self._talk, "/upload": self._upload}
-        self._web = WebServer(guard, PAGES, doors, PART, self._ready, self._fetch)
+        try:
+            self._web = WebServer(guard, PAGES, doors, PART, self._ready, self._fetch)
+        except PoiseError:
+            self.workers.close()
+            self._lock.release()
+            raise
+        self._lock.tell(self._web.url.partition("?")[0])
         for take in project.takes.values():
             if not (project.room(take) / "judged.json").exists() and not take.hidden:
                 self.look(take)
@@ -120,6 +129,7 @@ class OpenServer:
         self.workers.close()
         self._web.close()
         shutil.rmtree(self._jobs, ignore_errors=True)
+        self._lock.release()
 
     def add_file(self, path: Path, **more: Any) -> ProjectTake:
         """A motion of a file, looked at as soon as there is time; the same file is there once."""
