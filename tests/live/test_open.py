@@ -371,7 +371,7 @@ def test_a_project_has_one_page_at_a_time(tmp_path: Path) -> None:
     assert not (tmp_path / LOCK).exists()
     # A process that was killed holds nobody off, whatever its file says.
     script = (
-        "import os, sys; from pathlib import Path; from poise.live.open.project_lock import ProjectLock; "
+        "import sys; from pathlib import Path; from poise.live.open.project_lock import ProjectLock; "
         f"lock = ProjectLock(Path({str(tmp_path)!r})); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(

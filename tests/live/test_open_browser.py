@@ -17,6 +17,7 @@ from chromium import CHROMIUM, Page, opened
 from poise.cli.open import HEAVY, PRELOAD, look, rests, work
 from poise.formats import read_clip, write_clip
 from poise.live.admission import Guard
+from poise.live.open.actions import ACTIONS
 from poise.live.open.open_server import OpenServer, Runs
 from poise.live.open.project import Project
 from test_docs import WALK
@@ -81,7 +82,9 @@ def choose(page: Page, name: str) -> None:
 
 def press(page: Page, key: str, modifiers: int = 0) -> None:
     for kind in ("keyDown", "keyUp"):
-        page.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers)
+        number = 9 if key == "Tab" else 0
+        more = {"windowsVirtualKeyCode": number, "code": key} if number else {}
+        page.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **more)
 
 
 def test_a_motion_is_mended_gets_a_body_is_pushed_and_goes_out(
@@ -176,27 +179,99 @@ def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: P
     press(page, "k")
 
 
+#: Of what has the focus: its part of the page, a word on it, its edges, and whether a ring shows it.
+FOCUS = """(() => { const e = document.activeElement, b = e.getBoundingClientRect();
+    const part = e.closest('header, nav, main, aside, footer');
+    return [part ? part.tagName : '', e.id || e.textContent.trim(), b.left, b.top, b.right, b.bottom,
+            getComputedStyle(e).outlineStyle]; })()"""
+#: Roles of what somebody can do something with.
+CONTROLS = {
+    *("button", "textbox", "spinbutton", "checkbox", "combobox", "slider", "link", "application"),
+    *("DisclosureTriangle", "progressbar", "Canvas"),
+}
+
+
 def test_names_and_places_of_the_controls(page: Page) -> None:
-    """Each control has a name for screen readers, and lies within the window."""
+    """Each control of each form has a name for screen readers, is reached by Tab in the order of the
+    page, with a ring, and lies within the window; no choice is cut off."""
+    choose(page, "video")
     page.size(1280, 720)
-    nameless = page.js(
-        """[...document.querySelectorAll('button, select, input, canvas[tabindex], progress')].filter(
-        e => e.offsetParent && !(e.getAttribute('aria-label') || e.textContent.trim() || e.title
-        || (e.labels || []).length)).map(e => e.outerHTML)"""
-    )
-    assert nameless == []
+    page.call("Accessibility.enable")
+    for action in ACTIONS:
+        page.js(f"document.querySelector('#action-{action}').open = true")
+        page.js(
+            "document.querySelectorAll('aside details details, nav details').forEach(d => d.open = true)"
+        )
+        page.js(
+            f"document.querySelectorAll('#action-{action} .row:not(.box):last-child button').forEach("
+            "b => { if (/add|seat|floor|state/i.test(b.textContent)) b.click(); })"
+        )
+        tree = page.call("Accessibility.getFullAXTree")["nodes"]
+        names = [
+            (n["role"]["value"], n.get("name", {}).get("value", ""))
+            for n in tree
+            if not n["ignored"] and n["role"]["value"] in CONTROLS
+        ]
+        assert len(names) > 40 and not [x for x in names if len(x[1]) < 2], (action, names)
+        # Rows of a kind are groups that say which they are.
+        groups = {n["name"]["value"] for n in tree if n.get("role", {}).get("value") == "group"}
+        rows = page.js(
+            f"document.querySelectorAll('#action-{action} .rows .row [aria-label=limb]').length"
+        )
+        assert not rows or {"Stay put 1", "Touch 1", "Touch 2"} <= groups, (action, groups)
+        short = page.js(
+            f"""[...document.querySelectorAll('#action-{action} .field select')].filter(e => {{
+            const ink = document.createElement('canvas').getContext('2d');
+            ink.font = getComputedStyle(e).font;
+            const long = Math.max(...[...e.options].map(o => ink.measureText(o.text).width));
+            return e.offsetParent && e.id !== 'rig-onto' && long + 30 > e.clientWidth;
+            }}).map(e => e.id)"""
+        )
+        assert short == [], (action, short)
+        assert page.js("[...document.querySelectorAll('*')].every(e => e.tabIndex <= 0)")
+        if action != "body":
+            continue
+        page.js("document.activeElement.blur(); document.body.tabIndex = -1; document.body.focus()")
+        seen = list[list[object]]()
+        while True:
+            press(page, "Tab")
+            now = page.js(FOCUS)
+            # After the last one it begins anew.
+            if not now[0] or now in seen[:1]:
+                break
+            seen.append(now)
+        parts = [part for part, *_ in seen]
+        assert list(dict.fromkeys(parts)) == ["HEADER", "NAV", "MAIN", "ASIDE", "FOOTER"], action
+        assert parts == sorted(parts, key=["HEADER", "NAV", "MAIN", "ASIDE", "FOOTER"].index), action
+        for _, word, left, top, right, bottom, ring in seen:
+            assert left >= 0 and top >= 0 and right <= 1280 and bottom <= 720, (action, word)
+            assert ring != "none", (action, word)
     assert page.js("document.documentElement.scrollWidth") == 1280
     for side in ("aside", "nav"):
         name = f"document.querySelector('{side}')"
         assert page.js(f"{name}.scrollWidth - {name}.clientWidth") == 0
-    cut = page.js(
-        """[...document.querySelectorAll('header > *, #transport > *')].filter(e => {
-        const b = e.getBoundingClientRect();
-        return e.offsetParent && (b.right > innerWidth || b.bottom > innerHeight);
-        }).map(e => e.outerHTML)"""
-    )
-    assert cut == []
     dark = [{"name": "prefers-color-scheme", "value": "dark"}]
     light = page.js("getComputedStyle(document.body).backgroundColor")
     page.call("Emulation.setEmulatedMedia", features=dark)
     assert page.js("getComputedStyle(document.body).backgroundColor") != light
+
+
+def test_marks_of_the_timeline_by_keyboard(page: Page) -> None:
+    """N and P go from fault to fault; the slider says what is there; keys turn the view."""
+    choose(page, "video")
+    page.js("document.getElementById('timeline').focus()")
+    said = "document.getElementById('timeline').getAttribute('aria-valuetext')"
+    order = page.js("poiseOpen.state.judged.faults.map(f => f.start).sort((a, b) => a - b)")
+    press(page, "Home")
+    for start in order[:3]:
+        press(page, "n")
+        assert page.js("poiseOpen.state.frame") == start
+        assert "slides" in page.js(said) and f"frame {start} of 85" in page.js(said)
+    press(page, "p")
+    assert page.js("poiseOpen.state.frame") == order[1]
+    press(page, "PageUp")
+    assert page.js("poiseOpen.state.frame") == order[1] + 10
+    x, _, depth = page.js("poiseOpen.screen(12)")
+    press(page, ".")
+    where = "poiseOpen.screen(12)"
+    page.until(f"Math.abs({where}[0] - {x}) + Math.abs({where}[2] - {depth}) > 1e-4")

@@ -8,6 +8,7 @@ function actionForms(host, actions, world) {
     return made;
   };
   const names = (text) => text.replaceAll("_", " ");
+  const UNIT_WORDS = { N: "newtons", s: "seconds", m: "metres", Hz: "hertz" };
   const LIMBS = ["left_hand", "right_hand", "left_foot", "right_foot"];
 
   function build(action) {
@@ -49,12 +50,15 @@ function actionForms(host, actions, world) {
       if (field.low !== null) input.min = field.low;
       if (field.high !== null) input.max = field.high;
       input.oninput = () => { if (input.value !== "") set(Number(input.value)); };
+      if (field.unit) input.setAttribute("aria-label", `${field.label}, ${UNIT_WORDS[field.unit] || field.unit}`);
       show(() => { if (document.activeElement !== input) input.value = Number((form.values[field.name] ?? 0).toFixed(3)); });
       label.append(make("span", { className: "with" }, input, field.unit));
     } else if (field.kind === "choice") {
       const input = make("select", { id }, ...field.choices.map(([value, text]) => new Option(text, value)));
       input.onchange = () => set(input.value);
       show(() => { input.value = form.values[field.name]; });
+      // Words that would be cut off beside their label stand below it.
+      if (field.choices.some(([, text]) => text.length > 17)) label.classList.add("long");
       label.append(input);
     } else if (field.kind === "flag") {
       const input = make("input", { type: "checkbox", id });
@@ -69,6 +73,7 @@ function actionForms(host, actions, world) {
         input.value = form.values[field.name];
       });
       const drop = make("button", { type: "button", textContent: "Open rig", onclick: (event) => { event.preventDefault(); world.openRig(); } });
+      input.setAttribute("aria-label", field.label);
       label.append(make("span", { className: "with" }, input, drop));
     } else if (field.kind === "maps") {
       const input = make("input", { type: "text", id, placeholder: "Arm_L=upperarm_l" });
@@ -97,9 +102,16 @@ function actionForms(host, actions, world) {
       input.onchange = () => act(input.value);
       return input;
     };
+    // A row is a group of its own, so that its controls are told apart.
+    const one = (k, name, ...inside) => {
+      const made = make("div", { className: name }, ...inside);
+      made.setAttribute("role", "group");
+      made.setAttribute("aria-label", `${field.label} ${k + 1}`);
+      return made;
+    };
     const gone = (k) => {
       const button = make("button", { type: "button", className: "plain", textContent: "✕", onclick: () => set(form.values[field.name].filter((_, i) => i !== k)) });
-      button.setAttribute("aria-label", "Leave out");
+      button.setAttribute("aria-label", `Leave out ${field.label} ${k + 1}`);
       button.addEventListener("click", () => form.refresh());
       return button;
     };
@@ -118,16 +130,17 @@ function actionForms(host, actions, world) {
         const what = form.action.name === "cut" ? world.rangeText() : given.length ? given.join(", ") : "none yet: S marks the frame that is shown";
         return [make("span", { textContent: `${field.label}: ${what}` })];
       },
-      spans: () => form.values[field.name].map(([limb, first, last], k) => make("div", { className: "row" },
+      spans: () => form.values[field.name].map(([limb, first, last], k) => one(k, "row",
         limbs(limb, put(k, 0)), number(first, "first frame", put(k, 1), 1), number(last, "last frame", put(k, 2), 1), gone(k))),
-      touches: () => form.values[field.name].map(([limb, frame, x, y, z], k) => make("div", { className: "row" },
+      touches: () => form.values[field.name].map(([limb, frame, x, y, z], k) => one(k, "row",
         limbs(limb, put(k, 0), ["pelvis"]), number(frame, "frame", put(k, 1), 1), number(x, "x in m", put(k, 2)), number(y, "y in m", put(k, 3)),
         number(z, "height in m", put(k, 4)), gone(k))),
       vector: () => {
         if (form.action.name === "range") return [make("span", { textContent: `Range: ${world.rangeText()}` })];
         const v = form.values[field.name];
-        if (!v) return [make("span", { textContent: `${field.label}: from the front; drag on the figure to turn it` })];
-        return [make("div", { className: "row" }, `${field.label} `, ...v.map((value, i) => number(value, "xyz"[i], (n) => { const all = [...v]; all[i] = n; set(all); })),
+        if (!v) return [make("span", { textContent: `${field.label}: from the front; drag on the figure to turn it, or ` }),
+          make("button", { type: "button", textContent: "state it", onclick: () => { set(world.arrow()); form.refresh(); } })];
+        return [make("div", { className: "row" }, `${field.label} `, ...v.map((value, i) => number(value, `${field.label} ${"xyz"[i]}`, (n) => { const all = [...v]; all[i] = n; set(all); })),
           make("button", { type: "button", className: "plain", textContent: "✕", ariaLabel: "From the front", onclick: () => { set(null); form.refresh(); } }))];
       },
       boxes: () => form.values[field.name].map((box, k) => {
@@ -140,7 +153,7 @@ function actionForms(host, actions, world) {
           else all[k][name][i] = value;
           set(all);
         };
-        return make("div", { className: "row box" }, make("span", { textContent: box.kind }), gone(k),
+        return one(k, "row box", make("span", { textContent: box.kind }), gone(k),
           make("label", {}, "x ", number(box.pos[0], "x in m", change("pos", 0))), make("label", {}, "y ", number(box.pos[1], "y in m", change("pos", 1))),
           make("label", {}, "high ", number(box.pos[2] + box.size[2] / 2, "height of the seat in m", change("high"))),
           make("label", {}, "wide ", number(box.size[0], "width in m", change("size", 0))), make("label", {}, "deep ", number(box.size[1], "depth in m", change("size", 1))),

@@ -56,7 +56,7 @@
       rigs: () => (project ? project.takes : []).filter((t) => t.id !== current()).map((t) => [t.id, t.name]),
       frame: () => Math.round(frame), frames: () => (motion() ? motion().frames : 1), range: () => range,
       rangeText: () => (range ? `frames ${range[0]} to ${range[1]}` : "mark one on the timeline: I and O, or Shift and drag"),
-      limb: (name) => limbAt(name), seat: seatHere,
+      limb: (name) => limbAt(name), seat: seatHere, arrow: arrowNow,
     });
     for (const form of forms.values()) form.changed = () => { dirty = true; askLine(form); if (form.action.name === "chair") showBoxes(); };
     view.changed(() => { dirty = true; });
@@ -200,6 +200,7 @@
       name.style.paddingLeft = `${6 + 12 * depth}px`;
       name.title = t.line ? `${t.name}: ${t.line}` : t.name;
       name.dataset.take = t.id;
+      if (now) name.setAttribute("aria-current", "true");
       const sub = t.looking ? "reading" : t.line ? t.line.split(" ").slice(0, 2).join(" ") : t.suffix.slice(1).toUpperCase();
       name.append(make("small", { textContent: sub }));
       const row = make("div", { className: "take" }, name);
@@ -335,8 +336,11 @@
       b.style.background = faultColor(kind);
       const told = of[0][0].repairable ? "" : ", only told";
       const box = make("details", { className: "kind", open: of.length < 9 }, make("summary", { title: of[0][0].title }, b, `${faultName(kind)} (${of.length}${told})`));
-      for (const [f, k] of of.slice(0, 60))
-        box.append(make("button", { className: "fault", type: "button", title: faultText(f), onclick: () => goFault(k), textContent: `${f.joint || "whole body"}, ${f.start}${f.stop > f.start ? `–${f.stop}` : ""}` }));
+      for (const [f, k] of of.slice(0, 60)) {
+        const button = make("button", { className: "fault", type: "button", title: faultText(f), onclick: () => goFault(k), textContent: `${f.joint || "whole body"}, ${f.start}${f.stop > f.start ? `–${f.stop}` : ""}` });
+        button.setAttribute("aria-label", `${f.joint || "whole body"} ${faultName(f.kind)}, frames ${f.start} to ${f.stop}`);
+        box.append(button);
+      }
       return box;
     });
     if (j && !j.judged) rows.push(make("p", { className: "soft", textContent: "No human body is told by the joints' names, so feet and floor were not judged." }));
@@ -612,6 +616,12 @@
     const [x, y] = [places[3 * l] - places[3 * o], places[3 * l + 1] - places[3 * o + 1]], n = Math.hypot(x, y) || 1;
     return [(-y / n) * long, (x / n) * long, 0];
   }
+  // The direction of the arrow, in numbers.
+  function arrowNow() {
+    if (!motion() || !view.places) return [0, 1, 0];
+    const v = pushArrow(view.places), n = Math.hypot(...v) || 1;
+    return v.map((x) => Number((x / n).toFixed(3)));
+  }
   function limbAt(name) {
     const m = motion(), role = name === "pelvis" ? "hips" : name;
     const at = m && m.roles[role] !== undefined ? m.place(Math.round(frame), m.roles[role]) : [0, 0, 1];
@@ -768,7 +778,7 @@
   const KEYS = [
     ["Space", "play and pause"], ["J K L", "play back, pause, play on"], ["← →", "a frame back and on; with Shift ten"], ["Home End", "first and last frame"],
     ["N P", "the next and the last fault"], ["I O", "the range begins and ends here; X takes it off"], ["S", "keep this frame, for Between keys"],
-    ["C", "overlaid, side by side, hidden"], ["T", "foot trails"], ["F", "look at the figure"], ["Ctrl+Z", "undo; Ctrl+Shift+Z does it again"],
+    ["C", "overlaid, side by side, hidden"], ["T", "foot trails"], ["F", "look at the figure"], [", . + -", "turn the view, nearer and farther"], ["Ctrl+Z", "undo; Ctrl+Shift+Z does it again"],
     ["Ctrl+O", "open files"], ["Ctrl+E", "export"], ["?", "these keys"],
   ];
   $("help-keys").append(...KEYS.flatMap(([key, text]) => [make("dt", { textContent: key }), make("dd", { textContent: text })]));
@@ -798,6 +808,10 @@
     if (key === " ") play(playing ? 0 : 1);
     else if (key === "ArrowLeft") step(event.shiftKey ? -10 : -1);
     else if (key === "ArrowRight") step(event.shiftKey ? 10 : 1);
+    else if (key === "PageUp") step(10);
+    else if (key === "PageDown") step(-10);
+    else if (key === "," || key === ".") view.turn(key === "," ? -0.2 : 0.2);
+    else if (key === "+" || key === "-") view.turn(0, key === "+" ? 0.85 : 1 / 0.85);
     else if (key === "Home") step(-end);
     else if (key === "End") step(end);
     else if (key === "j") play(-1);

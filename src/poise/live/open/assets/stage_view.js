@@ -5,6 +5,7 @@ function stageView(host, over) {
     fov: 30, polar: 1.56, far: 60, reach: 5, depth: 26, fade: [2, 14], fog: [18, 60], sunAt: [2.4, -3, 8], detail: 10,
   });
   const { T, css, scene, camera, controls, place, solid } = base;
+  for (const canvas of [base.canvas, over]) canvas.setAttribute("aria-hidden", "true");
   controls.dampingFactor = 0.14;
   camera.position.set(3.6, -3.6, 2.2);
   controls.target.set(0, 0, 0.9);
@@ -105,6 +106,13 @@ function stageView(host, over) {
       matchMedia("(prefers-color-scheme: dark)").addEventListener("change", call);
     },
     frame() { placed = false; },
+    // Turns the view about what is looked at, rad, and comes nearer by a factor.
+    turn(angle, nearer = 1) {
+      moved.copy(camera.position).sub(controls.target);
+      const [x, y] = [moved.x, moved.y], [c, s] = [Math.cos(angle), Math.sin(angle)];
+      moved.set(c * x - s * y, s * x + c * y, moved.z).multiplyScalar(nearer).clampLength(0.5, 40);
+      camera.position.copy(controls.target).add(moved);
+    },
     setBoxes(given) {
       for (const mesh of boxes) { scene.remove(mesh); mesh.geometry.dispose(); }
       boxes = given.map((box) => {

@@ -53,7 +53,8 @@ function timelineView(canvas, acts) {
       ink.fillStyle = line;
       ink.fillRect(x, 0, 1, h);
       ink.fillStyle = soft;
-      ink.fillText(String(f), x + 3, 8);
+      const words = String(f), long = ink.measureText(words).width;
+      ink.fillText(words, x + 5 + long > w ? x - 3 - long : x + 3, 8);
     }
     // Faults, a row for each kind.
     marks = [];
@@ -186,7 +187,8 @@ function timelineView(canvas, acts) {
       draw();
       canvas.setAttribute("aria-valuemax", state.frames - 1);
       canvas.setAttribute("aria-valuenow", Math.round(frame));
-      canvas.setAttribute("aria-valuetext", moment);
+      const now = Math.round(frame), here = state.faults.filter((f) => f.start <= now && now <= f.stop).slice(0, 3);
+      canvas.setAttribute("aria-valuetext", [moment, ...here.map((f) => `${f.joint || "whole body"} ${faultName(f.kind)}`)].join(", "));
     },
   };
 }
