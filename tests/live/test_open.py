@@ -317,10 +317,10 @@ def test_a_process_waits_for_work_and_what_is_light_needs_none(
         ids = list[int]()
         for number in range(2):
             end = time.monotonic() + 20
-            while workers._spare is None and time.monotonic() < end:
+            while workers.spare is None and time.monotonic() < end:
                 time.sleep(0.02)
-            assert workers._spare is not None
-            ids.append(workers._spare[0].pid)
+            assert workers.spare is not None
+            ids.append(workers.spare)
             over.clear()
             argv = ["track", "-o", "result", *(("--seed", "9") if number else ())]
             workers.submit("work", toy_work, (argv,), ended)
@@ -329,9 +329,9 @@ def test_a_process_waits_for_work_and_what_is_light_needs_none(
         assert [(j.state, j.code) for j in told] == [("done", 0), ("crashed", -9)]
         assert len(set(ids)) == 2
         assert not any(_lives(number) for number in ids)
-        while workers._spare is None:
+        while workers.spare is None:
             time.sleep(0.02)
-        last = workers._spare[0].pid
+        last = workers.spare
         assert _lives(last)
     finally:
         workers.close()

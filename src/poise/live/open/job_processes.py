@@ -179,6 +179,12 @@ class Workers:
                 process.kill()
                 process.join(2.0)
 
+    @property
+    def spare(self) -> int | None:
+        """Number of the process that waits for work, None while there is none."""
+        spare = self._spare
+        return None if spare is None else spare[0].pid
+
     def told(self) -> list[dict[str, Any]]:
         """Jobs that wait or run, for the page."""
         with self._lock:
