@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from poise.body import BodyConfig
 from poise.formats import write_clip
@@ -285,7 +284,7 @@ def test_feet_that_a_humanoid_turns_otherwise_stand_on_the_floor(data_dir: Path)
     library, _ = library_of(paths, onto=data_dir / "cmu_amc/02/02_01.amc")
     body, motions, _ = fit_humanoid(library)
     for qpos in motions:
-        pose = Kinematics(body.table)(torch.tensor(qpos))
+        pose = Kinematics(body.table)(qpos)
         heights = stance_heights(body.table, pose.pos, pose.quat, 30.0)
         assert len(heights) > 100 and abs(float(np.median(heights))) < 0.02
 
@@ -327,7 +326,7 @@ def test_every_clip_in_a_mirror_too(folder: Path) -> None:
         left, right = (clip.skeleton.index(f"{s}Hand") for s in ("Left", "Right"))
         apart = seen.positions()[:, left] - clip.positions()[:, right] * [1.0, -1.0, 1.0]
         assert np.linalg.norm(apart, axis=-1).max() < 0.02
-        pose = Kinematics(body.table)(torch.tensor(clip_to_qpos(seen, body.table)))
+        pose = Kinematics(body.table)(clip_to_qpos(seen, body.table))
         assert abs(float(stance_heights(body.table, pose.pos, pose.quat, seen.fps).mean())) < 0.02
 
 
