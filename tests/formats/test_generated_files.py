@@ -91,17 +91,27 @@ def test_hy_motion_npz_has_30_frames_a_second(tmp_path: Path) -> None:
     assert clip.fps == 30.0 and any("HY-Motion" in n for n in clip.skeleton.source.notes)
 
 
-def test_gvhmr_files_are_refused_with_lines_that_convert_them(tmp_path: Path) -> None:
-    poses = np.zeros((6, 63))
-    told = {"body_pose": poses, "global_orient": np.zeros((6, 3)), "transl": np.zeros((6, 3))}
-    told["betas"] = np.zeros((6, 10))
-    torch.save({"smpl_params_global": told}, tmp_path / "hmr4d_results.pt")
-    with refused("pickle-refused") as caught:
-        read_clip(tmp_path / "hmr4d_results.pt")
-    assert "weights_only=True" in str(caught.value)
-    np.savez(tmp_path / "motion.npz", fps=30, **{k: v for k, v in told.items()})
-    clip = read_clip(tmp_path / "motion.npz")
+def test_gvhmrs_result_is_read_as_its_npz_is(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    told = {"body_pose": 0.2 * rng.normal(size=(6, 63)), "global_orient": np.zeros((6, 3))}
+    told |= {"transl": rng.normal(size=(6, 3)), "betas": np.zeros((6, 10))}
+    tensors = {k: torch.tensor(v) for k, v in told.items()}
+    # As GVHMR writes it: tensors that share their numbers, of other types, and views of them.
+    tensors["betas"] = torch.zeros(1, 10).expand(6, 10)
+    tensors["transl"] = torch.tensor(told["transl"].T.copy()).T
+    more = {"x": torch.ones(2, 3, dtype=torch.float16)[:, 1:], "seen": torch.tensor([True, False])}
+    whole = {"smpl_params_global": tensors, "smpl_params_incam": tensors, "net_outputs": more}
+    torch.save(whole, tmp_path / "hmr4d_results.pt")
+    with refused("pickle-refused", says=("--allow-pickle",)):
+        read_clip(tmp_path / "hmr4d_results.pt", fps=30)
+    with refused("rate-missing", says=("--fps",)):
+        read_clip(tmp_path / "hmr4d_results.pt", allow_pickle=True)
+    clip = read_clip(tmp_path / "hmr4d_results.pt", fps=30, allow_pickle=True)
+    np.savez(tmp_path / "motion.npz", fps=30, up_axis="Y", **told)
+    same = read_clip(tmp_path / "motion.npz")
+    np.testing.assert_allclose(clip.positions(), same.positions(), atol=1e-6)
     assert clip.fps == 30.0 and len(clip.skeleton) == 22 and clip.skeleton.source.up_axis == "Y"
+    assert "GVHMR's motion in the world" in clip.skeleton.source.notes[0]
 
 
 def test_a_clip_of_the_house_is_not_taken_for_kimodos(tmp_path: Path) -> None:

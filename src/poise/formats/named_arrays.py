@@ -328,6 +328,27 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
     return clip.replaced(skeleton=clip.skeleton.with_source(notes=(*note, *source.notes)))
 
 
+def looks_like_torch(head: bytes) -> bool:
+    """Whether a file's first bytes are those of a zip that begins with the pickle of torch."""
+    return first_member(head).endswith(b"/data.pkl")
+
+
+def read_torch(path: Path, options: ReadOptions) -> Clip:
+    """The clip in a file of `torch.save`, such as GVHMR's; to be asked for as pickles are."""
+    from poise.formats.torch_files import is_gvhmr, load_torch
+
+    if not options.allow_pickle:
+        raise PoiseError("this is a pickled file of torch", path, ASK, code="pickle-refused")
+    value, note = load_torch(path), ()
+    if is_gvhmr(value):
+        # GVHMR's world has gravity along -Y.
+        value = {"up_axis": "Y", **value["smpl_params_global"]}
+        note = ("GVHMR's motion in the world, Y up; that in the camera's frame was left",)
+    clip = _read(named_arrays(value, path), path, options)
+    source = clip.skeleton.source
+    return clip.replaced(skeleton=clip.skeleton.with_source(notes=(*note, *source.notes)))
+
+
 def _is_known(data: Mapping[str, Any]) -> bool:
     return any(kind.holds(data) for kind in KINDS[:-1])
 

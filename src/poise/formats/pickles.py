@@ -175,8 +175,13 @@ def named_arrays(value: Any, path: Path) -> dict[str, Any]:
 
 def loads_restricted(data: bytes, where: str | Path) -> Any:
     """The plain value in a pickle's bytes; see `load_plain`."""
+    return plain_value(RestrictedMachine(data, where), where)
+
+
+def plain_value(machine: RestrictedMachine, where: str | Path) -> Any:
+    """The plain value that a machine makes; see `load_plain`."""
     try:
-        return _plain(_Machine(data, where).load(), {}, 0)
+        return _plain(machine.load(), {}, 0)
     except _DAMAGE as error:
         raise PoiseError(
             f"the pickle is damaged ({shown(error)})", where, CUT_OFF, code="file-damaged"
@@ -192,7 +197,7 @@ class _Named:
     name: str
 
 
-class _Machine(_Library):
+class RestrictedMachine(_Library):
     """The pickle machine with fewer instructions, a limit on them and on the bytes of arrays.
 
     A pickle is a program for a stack machine that may call any function. This machine is the standard
@@ -202,13 +207,17 @@ class _Machine(_Library):
     memory for whatever index or length a file states.
     """
 
+    #: Instructions, and names of classes and functions, that a kind of file needs besides.
+    extra: frozenset[str] = frozenset()
+    types: frozenset[str] = frozenset()
+
     def __init__(self, data: bytes, where: str | Path):
         # Python 2 wrote bytes as text.
         super().__init__(io.BytesIO(data), encoding="latin-1")
-        self.where, self.steps, self.made = where, 0, 0
+        self.where, self.steps, self.bytes_made = where, 0, 0
         self.dispatch = self
 
-    def __getitem__(self, code: int) -> Callable[[_Machine], None]:
+    def __getitem__(self, code: int) -> Callable[[RestrictedMachine], None]:
         """The step of an instruction, where `load` looks for it."""
         self.steps += 1
         if self.steps > _MAX_STEPS:
@@ -216,6 +225,8 @@ class _Machine(_Library):
                 f"the pickle has more than {_MAX_STEPS} instructions", self.where, code="over-limit"
             )
         name = _NAMES.get(code, "an unknown instruction")
+        if name in self.extra:
+            return _Library.dispatch[code]
         if name not in _STEPS:
             raise PoiseError(
                 f"the pickle uses {name}, which plain data does not need",
@@ -228,7 +239,7 @@ class _Machine(_Library):
         named = f"{module}.{name}"
         for core in _CORE:
             named = named.replace(core, "numpy.core.", 1) if named.startswith(core) else named
-        if named not in CALLS and named not in _TYPES:
+        if named not in CALLS and named not in _TYPES and named not in self.types:
             raise PoiseError(
                 f"the pickle names {shown(named)}, which is no plain data, and was not read",
                 self.where,
@@ -240,9 +251,9 @@ class _Machine(_Library):
     def counted(self, value: Any) -> Any:
         """The value, unless the arrays made so far grow beyond all need (a few bytes shared often)."""
         inner = value.value if isinstance(value, Array) else value
-        self.made += inner.nbytes if isinstance(inner, np.ndarray) else 0
-        self.made += len(inner) if isinstance(inner, bytes) else 0
-        if self.made > 2 * MAX_ARRAY_BYTES:
+        self.bytes_made += inner.nbytes if isinstance(inner, np.ndarray) else 0
+        self.bytes_made += len(inner) if isinstance(inner, bytes) else 0
+        if self.bytes_made > 2 * MAX_ARRAY_BYTES:
             raise PoiseError(
                 "the pickle holds more arrays than the limit", self.where, code="over-limit"
             )
@@ -251,10 +262,17 @@ class _Machine(_Library):
     def reduce(self) -> None:
         """Makes what the file names, by our own function for it."""
         args = checked(tuple, self.stack.pop())
-        name = checked(_Named, self.stack[-1]).name
+        self.stack[-1] = self.counted(self.made(self.name_of(self.stack[-1]), args))
+
+    def name_of(self, value: Any) -> str:
+        """The name of a class or function that the file names."""
+        return checked(_Named, value).name
+
+    def made(self, name: str, args: tuple[Any, ...]) -> Any:
+        """What a function of a name makes, by our own for it."""
         if name not in CALLS:
             raise ValueError(f"{name} cannot be made")
-        self.stack[-1] = self.counted(CALLS[name](*args))
+        return CALLS[name](*args)
 
     def build(self) -> None:
         """Fills an array or a type with its state."""
@@ -296,12 +314,12 @@ _TAKEN = (
 )
 _STEPS: dict[str, Callable[[Any], None]] = {
     **{name: _Library.dispatch[code] for code, name in _NAMES.items() if name in _TAKEN},
-    "REDUCE": _Machine.reduce,
-    "BUILD": _Machine.build,
-    "DICT": _Machine.make_dict,
-    "SETITEM": _Machine.set_one,
+    "REDUCE": RestrictedMachine.reduce,
+    "BUILD": RestrictedMachine.build,
+    "DICT": RestrictedMachine.make_dict,
+    "SETITEM": RestrictedMachine.set_one,
     "SETITEMS": lambda machine: machine.set_items(machine.pop_mark()),
-    "BYTEARRAY8": _Machine.byte_array,
+    "BYTEARRAY8": RestrictedMachine.byte_array,
 }
 
 

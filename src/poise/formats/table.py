@@ -113,6 +113,13 @@ READERS = (
         asks=(".pkl",),
     ),
     Reader(
+        "torch",
+        (".pt", ".pth"),
+        _late("named_arrays", "looks_like_torch"),
+        _late("named_arrays", "read_torch"),
+        asks=(".pt", ".pth"),
+    ),
+    Reader(
         "TRC keypoints",
         (".trc",),
         _late("poise.formats.point_tables:looks_like_trc"),
@@ -163,10 +170,7 @@ _MAGIC = (
     (b"PK\x03\x04", "zip"),
     (b"\x89HDF", "HDF5"),
 )
-_TORCH = (
-    "For GVHMR: import numpy, torch; d = torch.load(FILE, weights_only=True)['smpl_params_global']; "
-    "numpy.savez('motion.npz', fps=RATE, **{k: v.numpy() for k, v in d.items()})"
-)
+_TORCH = "Save it anew with a torch of this decade: torch.save writes a zip since 1.6"
 _NOT_YET = {
     ".h5": "HDF5",
     ".vmd": "VMD",
@@ -268,9 +272,7 @@ def _reader_of(path: Path) -> Reader:
                 return reader
     suffix = path.suffix.lower()
     if suffix in (".pt", ".pth"):
-        raise PoiseError(
-            "files of torch are pickles, which are not read", path, _TORCH, code="pickle-refused"
-        )
+        raise PoiseError("it is no zip that torch.save writes", path, _TORCH, code="pickle-refused")
     other = next((name for magic, name in _MAGIC if head.startswith(magic)), _NOT_YET.get(suffix))
     if other is not None:
         raise PoiseError(f"{other} files are not read yet", path, READABLE, code="format-not-read")
