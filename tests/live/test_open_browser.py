@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -232,7 +233,7 @@ def test_names_and_places_of_the_controls(page: Page) -> None:
         if action != "body":
             continue
         page.js("document.activeElement.blur(); document.body.tabIndex = -1; document.body.focus()")
-        seen = list[list[object]]()
+        seen = list[Any]()
         while True:
             press(page, "Tab")
             now = page.js(FOCUS)
