@@ -50,7 +50,7 @@ def load_torch(path: Path) -> Any:
             machine = _TorchMachine(read("data.pkl", MAX_ARRAY_BYTES), path)
             machine.storage = lambda key: read(f"data/{key}", MAX_ARRAY_BYTES)
             return plain_value(machine, path)
-    except (zipfile.BadZipFile, KeyError, EOFError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, KeyError, EOFError, RuntimeError) as error:
         what = f"the file of torch is damaged ({shown(error)})"
         raise PoiseError(what, path, CUT_OFF, code="file-damaged") from None
 
