@@ -115,8 +115,8 @@ READERS = (
     Reader(
         "torch",
         (".pt", ".pth"),
-        _late("named_arrays", "looks_like_torch"),
-        _late("named_arrays", "read_torch"),
+        _late("poise.formats.named_arrays:looks_like_torch"),
+        _late("poise.formats.named_arrays:read_torch"),
         asks=(".pt", ".pth"),
     ),
     Reader(
