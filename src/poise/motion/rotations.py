@@ -14,7 +14,7 @@ from typing import Any, cast, overload
 
 import numpy as np
 
-from poise.motion.vectors import Array, constant_like, cross, floored, limited, mapped, namespace, norm
+from poise.motion.vectors import Array, constant_like, cross, floored, limited, namespace, norm
 
 
 def _bilinear(a: Array, b: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
@@ -23,7 +23,8 @@ def _bilinear(a: Array, b: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
     One outer product and one small matrix product take the place of some thirty passes over short
     strided columns, which cost more than their arithmetic.
     """
-    return mapped(a[..., :, None] * b[..., None, :], rows)
+    outer = a[..., :, None] * b[..., None, :]
+    return outer.reshape(*outer.shape[:-2], 16) @ constant_like(rows, outer)
 
 
 #: Row 4 i + j holds what a_i b_j adds to (w, x, y, z) of the Hamilton product.
@@ -375,8 +376,11 @@ def yaw_quat(angle: float) -> np.ndarray: ...
 def yaw_quat(angle: Array) -> Array: ...
 def yaw_quat(angle: Any) -> Any:
     """`(..., 4)` wxyz float64, turns about Z by `angle (...)` rad."""
+    if isinstance(angle, float | int):
+        half = 0.5 * angle
+        return np.array((np.cos(half), 0.0, 0.0, np.sin(half)))
     xp = namespace(angle)
-    return _about_up(0.5 * xp.astype(xp.asarray(angle), xp.float64))
+    return _about_up(0.5 * xp.astype(angle, xp.float64))
 
 
 def ahead_angle(quat: Array) -> float:

@@ -32,7 +32,8 @@ def namespace(array: Any) -> Any:
     return found
 
 
-_MADE: dict[tuple[int, Any, Any], tuple[Sequence[Any], Any]] = {}
+_MADE: dict[Any, tuple[Sequence[Any], Any]] = {}
+_DOUBLE = np.dtype(np.float64)
 
 
 def constant_like(rows: Sequence[Any], array: Any) -> Any:
@@ -41,7 +42,8 @@ def constant_like(rows: Sequence[Any], array: Any) -> Any:
     It is made once for each kind and shared, so do not write on it. `rows` is known by its identity,
     since to hash what it holds takes as long as a product: hand in a constant.
     """
-    key = (id(rows), array.dtype, array.device)
+    plain = type(array) is np.ndarray and array.dtype is _DOUBLE
+    key = id(rows) if plain else (id(rows), array.dtype, array.device)
     made = _MADE.get(key)
     if made is None or made[0] is not rows:
         out = namespace(array).asarray(rows, dtype=array.dtype, device=array.device)
