@@ -113,7 +113,7 @@ READERS = (
         asks=(".pkl",),
     ),
     Reader(
-        "torch",
+        "GVHMR",
         (".pt", ".pth"),
         _late("poise.formats.named_arrays:looks_like_torch"),
         _late("poise.formats.named_arrays:read_torch"),
