@@ -273,7 +273,7 @@ TABLES: dict[str, Table] = {
         "scene",
         (
             Column("stiffness of a hand, N/m", ("stiffness_n_per_m",)),
-            Column("force on a hand, N", ("force_n", "across_n")),
+            Column("force on a hand, N", ("force_mean_n", "force_n", "across_n")),
             Column("torque, N m", ("torque_nm",)),
             Column("stays up, s", ("stays_s",), "1"),
             _done("lost", "lost"),

@@ -304,25 +304,31 @@ def scene_rows(places: Places, raws: Raws) -> Iterator[Figure]:
         for way, figures in raw.items():
             if way == "episodes":
                 continue
+            # Forces on a rod are fictional, so that their size tells nothing.
+            fictional = "stays_s" in figures
             for name, every in figures.items():
                 known = [x for x in every if x is not None]
-                if not known:
+                if not known or (fictional and name.startswith(("force_", "impulse_"))):
                     continue
-                value = sum(known) if name in COUNTS else statistics.fmean(known)
+                value = statistics.fmean(known)
                 yield Figure(f"{unit}, {way}", name, value, len(known), interval(known, name))
             peaks = figures.get("force_peak_n")
-            if peaks:
+            if peaks and not fictional:
                 yield Figure(f"{unit}, {way}", "force_most_n", max(peaks), len(peaks))
 
 
 def interval(values: list[float], name: str) -> str:
-    """The interval of 95 % of a mean, or of a count, as text."""
-    if len(values) < 2:
+    """The interval of 95 % of a mean, by Wilson of the share of episodes in `COUNTS`, as text."""
+    n, z = len(values), 1.96
+    if n < 2:
         return ""
     mean = statistics.fmean(values)
-    error = 1.96 * statistics.stdev(values) / math.sqrt(len(values))
-    times = len(values) if name in COUNTS else 1
-    return f"{short(times * (mean - error))} to {short(times * (mean + error))}"
+    if name not in COUNTS:
+        error = z * statistics.stdev(values) / math.sqrt(n)
+        return f"{short(mean - error)} to {short(mean + error)}"
+    middle = (mean + z * z / (2 * n)) / (1 + z * z / n)
+    error = z * math.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    return f"{short(max(middle - error, 0.0))} to {short(min(middle + error, 1.0))}"
 
 
 def nobody(
