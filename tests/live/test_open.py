@@ -151,7 +151,7 @@ def test_a_crash_loses_nothing_and_work_can_be_stopped(client: Client):
     client.send(type="run", take=walk["id"], action="body", values={"seed": 60})
     job = client.until(lambda s: next((j for j in s["jobs"] if j["share"] == 0.4), None))
     assert job["text"] == "looking ahead, 40 % done, 0:01 left"
-    # What is simulated so far can be seen, in whole rows, from any of them on.
+    # The frames simulated so far can be seen, in whole rows, from any of them on.
     client.until(lambda s: s["jobs"] and s["jobs"][0]["drawn"])
     for row, firsts in ((0, [0, 1, 2]), (2, [2]), (7, [])):
         where = f"http://{client.where}/drawn/{job['id']}/{row}?token=secret-word"

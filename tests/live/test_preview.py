@@ -1,4 +1,4 @@
-"""What is simulated so far, for the page: the places of the character in the world of its motion."""
+"""The frames simulated so far, for the page: the places of the character in the world of its motion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from poise.formats import read_clip
 from poise.jobs.track import track
-from poise.jobs.track.controllers import Draws
+from poise.jobs.track.controllers import DrawsSteps
 from poise.live.open.job_processes import drawn_since
 from poise.live.open.preview import Preview
 from poise.motion import trim
@@ -34,7 +34,7 @@ def test_states_are_drawn_where_the_result_has_them(
     clip = trim(read_clip(WALK), 0, 24)
     told = list[tuple[str, int, int]]()
     preview = Preview(lambda *row: told.append(row), tmp_path / "drawn.bin")
-    assert isinstance(preview, Draws)
+    assert isinstance(preview, DrawsSteps)
     result = track(clip, controller="policy", progress=preview)
     header, frames, pos = rows_of(tmp_path / "drawn.bin")
     assert result.simulation is not None

@@ -87,7 +87,8 @@ CALLS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         (RNG.normal(size=(401, 3)), V[:1, 0], r.normalize(RNG.normal(size=(1, 401, 4)))),
     ),
     "matrix_kinematics": (
-        lambda *a: r.matrix_kinematics(PARENTS, *a)[0], (V[0], W[:, 0], r.quat_to_matrix(Q)),
+        lambda *a: r.matrix_kinematics(PARENTS, *a)[0],
+        (V[0], W[:, 0], r.quat_to_matrix(Q)),
     ),
     "mpjpe_global": (mpjpe_global, (V, NEAR)),
     "mpjpe_root": (mpjpe_root, (V, NEAR)),
@@ -114,7 +115,7 @@ CALLS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
     "sliding": (lambda v: sliding(v, 3), (A,)),
     "like": (lambda v: like(((1, 2, 3),), v), (V,)),
     "constant_like": (lambda v: constant_like((1, 0, 2), v), (V,)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CALLS)
@@ -140,8 +141,11 @@ def test_bodies_are_posed_alike() -> None:
     for of in (kinematics, single):
         np.testing.assert_allclose(of.local_quats(qpos), of.local_quats(torch.tensor(qpos)), atol=1e-6)
     shapes, feet = shapes_of(table), [i for i, row in enumerate(table.rows) if row.kind == "foot"]
-    for what in (lambda p, q: lowest_height(table, p, q), lambda p, q: centre_of_mass(table, p, q),
-                 lambda p, q: foot_points(p, q, shapes, feet)):  # fmt: skip
+    for what in (
+        lambda p, q: lowest_height(table, p, q),
+        lambda p, q: centre_of_mass(table, p, q),
+        lambda p, q: foot_points(p, q, shapes, feet),
+    ):
         np.testing.assert_allclose(what(*here[:2]), what(*there[:2]).numpy(), atol=1e-12)
 
 

@@ -233,7 +233,7 @@ def failure(problem: BaseException) -> tuple[int, PoiseError]:
     return 1, PoiseError(f"unexpected {type(problem).__name__}{said}", hint=hint, code="internal-fault")
 
 
-#: What verbs that simulate or learn need, by the module's name.
+#: Packages that verbs need which simulate or learn, by the module's name.
 _HEAVY = {
     "torch": "torch",
     "mujoco": "mujoco",

@@ -446,7 +446,7 @@ class ImitationEnv:
 
     @property
     def recorded(self) -> frozenset[str]:
-        """What is replayed from a recording by now: "observe", the observations of worlds that begin
+        """Parts that are replayed from a recording: "observe", the observations of worlds that begin
         anew, and "judge", all terms after a step. Terms that look at values, see `record`, never are."""
         return self._terms.recorded
 
@@ -526,7 +526,7 @@ class ImitationEnv:
 
     @cached_property
     def clip_features(self) -> ClipFeatures:
-        """What a motion prior sees of the clips' frames."""
+        """Features of the clips' frames, as a motion prior sees them."""
         return ClipFeatures(self.reference, self._terms.style, left=self._left)
 
     # --- copies and persistence ---------------------------------------------------------------

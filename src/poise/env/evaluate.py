@@ -34,7 +34,7 @@ class Recorded:
 
     @property
     def replays(self) -> bool:
-        """Whether it is replayed from a recording by now."""
+        """True once the function is replayed from a recording."""
         return self._function is not self._plain
 
     def __call__(self, *given: Tensor) -> tuple[Tensor, ...]:
@@ -212,7 +212,7 @@ class Terms:
 
     @property
     def recorded(self) -> frozenset[str]:
-        """Which of "observe" and "judge" are replayed from a recording by now, see `record`."""
+        """The names among "observe" and "judge" that are replayed from a recording, see `record`."""
         known = self._recorded.items()
         return frozenset(
             name

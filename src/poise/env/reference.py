@@ -166,7 +166,7 @@ class GoalRows:
 
     @property
     def misleads(self) -> bool:
-        """Whether policies are told something else than what characters are judged by."""
+        """True where policies are told another motion than the one that judges characters."""
         return self.told is not self.judged
 
     @property
@@ -366,7 +366,7 @@ class Reference:
 
     @property
     def misleads(self) -> bool:
-        """Whether policies are told something else than what characters are judged by."""
+        """True where policies are told another motion than the one that judges characters."""
         return self.goal_rows.misleads
 
     def gather(self, clip: Tensor, frame: Tensor) -> Pose:

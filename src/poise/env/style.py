@@ -43,7 +43,7 @@ class ClipFeatures:
 
     @property
     def kept(self) -> bool:
-        """Whether the features of all frames are kept by now."""
+        """True once the features of all frames are kept."""
         return self._all is not None
 
     def __call__(self, rows: Tensor) -> Tensor:

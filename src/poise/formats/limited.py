@@ -24,7 +24,7 @@ SECONDS, SECONDS_EACH = 20.0, 2e-6
 #: A busy machine may need so many times longer.
 _PATIENCE = 8.0
 _SCRIPT = Path(__file__).with_name("apart.py")
-#: What is set in that process: libraries that work in threads reserve memory for each of them.
+#: Variables of that process: libraries that work in threads reserve memory for each of them.
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1"
 )

@@ -329,7 +329,7 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
 
 
 def looks_like_torch(head: bytes) -> bool:
-    """Whether a file's first bytes are those of a zip that begins with the pickle of torch."""
+    """True if a file's first bytes are those of a zip that begins with the pickle of torch."""
     return first_member(head).endswith(b"/data.pkl")
 
 

@@ -468,7 +468,7 @@ def pack_clips(clips: Sequence[Clip]) -> tuple[dict[str, np.ndarray], list[dict[
 
 
 def unpack_clips(arrays: Mapping[str, Any], notes: Sequence[Mapping[str, Any]]) -> list[Clip]:
-    """What `pack_clips` packed, as arrays or as tensors.
+    """The clips that `pack_clips` packed, as arrays or as tensors.
 
     Raises:
         PoiseError: a key is missing, or of another kind.

@@ -269,7 +269,7 @@ class RestrictedMachine(_Library):
         return checked(_Named, value).name
 
     def made(self, name: str, args: tuple[Any, ...]) -> Any:
-        """What a function of a name makes, by our own for it."""
+        """The result of a named function, made by our own in its place."""
         if name not in CALLS:
             raise ValueError(f"{name} cannot be made")
         return CALLS[name](*args)

@@ -67,7 +67,7 @@ def _running_median(x: np.ndarray, half: int) -> np.ndarray:
     # Long recordings go in pieces, so that the windows of one piece fit into little memory.
     piece = max(1, _PIECE // (x.shape[1] * (2 * half + 1)))
     if len(x) > 4 * half > 0 and not np.isnan(x).any():
-        # Where a window is whole, its middle alone is asked for.
+        # Of a whole window the middle alone is asked for.
         inner = np.lib.stride_tricks.sliding_window_view(x, 2 * half + 1, 0)
         pieces = [
             np.partition(inner[start : start + piece], half, axis=-1)[..., half]

@@ -17,15 +17,22 @@ from poise.formats.text import CUT_OFF, shown
 
 #: Element types of tensors by the class of their storage.
 _KINDS = {
-    "Float": "<f4", "Double": "<f8", "Half": "<f2", "Long": "<i8", "Int": "<i4", "Short": "<i2",
-    "Char": "<i1", "Byte": "<u1", "Bool": "<?",
-}  # fmt: skip
+    "Float": "<f4",
+    "Double": "<f8",
+    "Half": "<f2",
+    "Long": "<i8",
+    "Int": "<i4",
+    "Short": "<i2",
+    "Char": "<i1",
+    "Byte": "<u1",
+    "Bool": "<?",
+}
 _STORAGES = {f"torch.{kind}Storage": np.dtype(code) for kind, code in _KINDS.items()}
 _TENSOR = "torch._utils._rebuild_tensor_v2"
 
 
 def load_torch(path: Path) -> Any:
-    """What a file of `torch.save` holds, as it is written since torch 1.6: plain values, and arrays in
+    """The content of a file of `torch.save` since torch 1.6: plain values, and arrays in
     place of tensors.
 
     Such a file is a zip with a pickle, `data.pkl`, that names the bytes of tensors beside it.
@@ -103,5 +110,5 @@ class _TorchMachine(RestrictedMachine):
 
 
 def is_gvhmr(value: Any) -> bool:
-    """Whether it is what GVHMR writes as `hmr4d_results.pt`."""
+    """True for the content of GVHMR's `hmr4d_results.pt`."""
     return isinstance(value, Mapping) and isinstance(value.get("smpl_params_global"), Mapping)

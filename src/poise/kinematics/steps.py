@@ -429,9 +429,14 @@ def path_of(
 
 
 def _from_and_to(
-    t: np.ndarray, k: int, swings: Sequence[Swing], up: tuple[bool, bool], ends: Ends, tip: np.ndarray,
+    t: np.ndarray,
+    k: int,
+    swings: Sequence[Swing],
+    up: tuple[bool, bool],
+    ends: Ends,
+    tip: np.ndarray,
     turn: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """A foot that stands in a keyframe and is not level there gets level beside it."""
     seconds = float(t[-1])
     for end, since in ((0, t), (1, seconds - t)):

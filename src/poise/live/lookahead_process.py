@@ -155,7 +155,7 @@ class AheadBeside:
 
     @property
     def decides(self) -> bool:
-        """Whether something is being decided, so that nothing else is asked."""
+        """True while an action is being decided; nothing else is asked meanwhile."""
         return self._waiting and self._told.empty()
 
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:

@@ -130,10 +130,16 @@ def quat_to_matrix(q: Array) -> Array:
     """Rotation matrices `(..., 3, 3)` with the local axes in the parent frame as columns."""
     xp, (w, x, y, z) = namespace(q), (q[..., k] for k in range(4))
     cells = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
     return xp.stack(cells, axis=-1).reshape(*q.shape[:-1], 3, 3)
 
 

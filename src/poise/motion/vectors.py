@@ -82,12 +82,6 @@ def limited(v: Array, least: float | None = None, most: float | None = None) -> 
     return v if most is None else np.minimum(v, most)
 
 
-def mapped(outer: Array, rows: Sequence[Any]) -> Array:
-    """Products `(..., n, m)` summed by the columns of `rows (n m, k)`: `(..., k)`."""
-    flat = outer.reshape(*outer.shape[:-2], outer.shape[-2] * outer.shape[-1])
-    return flat @ constant_like(rows, outer)
-
-
 #: Row 3 i + j holds what u_i v_j adds to u x v.
 _CROSS = (
     (0, 0, 0), (0, 0, 1), (0, -1, 0),
@@ -100,7 +94,8 @@ def cross(u: Array, v: Array) -> Array:
     """u x v of vectors `(..., 3)` that broadcast."""
     if isinstance(u, np.ndarray):
         # NumPy's own takes thirty passes over strided columns.
-        return mapped(u[..., :, None] * v[..., None, :], _CROSS)
+        outer = u[..., :, None] * v[..., None, :]
+        return outer.reshape(*outer.shape[:-2], 9) @ constant_like(_CROSS, outer)
     import torch
 
     # The same number of dimensions is asked for.

@@ -436,7 +436,7 @@ class Filler:
 
 
 def _seen(x: np.ndarray) -> Tensor:
-    """What a network is shown, as a batch of one."""
+    """A network's input, as a batch of one."""
     return torch.tensor(x, dtype=torch.float32)[None]
 
 

@@ -20,7 +20,7 @@ from poise.motion.roles import SIDES, find_roles
 from toy_human import human, swing
 
 PLACE = RetargetConfig(hands="place")
-#: Where hands are held, from the chest of the toy, m: in front, and clear of the body.
+#: Places of the hands, from the chest of the toy, m: in front, and clear of the body.
 AHEAD = {"Left": (0.42, 0.35, 0.1), "Right": (0.38, -0.4, 0.2)}
 
 

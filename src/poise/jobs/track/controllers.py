@@ -37,7 +37,7 @@ Show = Callable[[str, int, int], None]
 
 
 @runtime_checkable
-class Draws(Protocol):
+class DrawsSteps(Protocol):
     """A `Show` that draws the character as it is simulated."""
 
     def __call__(self, what: str, done: int, of: int) -> None:
@@ -269,7 +269,7 @@ class StepProgress:
 class StepDrawing:
     """Draws the first character at each control step of an episode that begins at frame `first`."""
 
-    def __init__(self, draws: Draws, first: int = 0):
+    def __init__(self, draws: DrawsSteps, first: int = 0):
         self.draws, self.first = draws, first
 
     def see(self, env: ImitationEnv, step: int) -> bool:
@@ -284,9 +284,9 @@ def drawing(show: Show | None, first: int = 0) -> list[StepDrawing]:
     return [] if draws is None else [StepDrawing(draws, first)]
 
 
-def draws_of(show: Show | None) -> Draws | None:
+def draws_of(show: Show | None) -> DrawsSteps | None:
     """Who is told, if it draws."""
-    return show if isinstance(show, Draws) else None
+    return show if isinstance(show, DrawsSteps) else None
 
 
 class ResetOnFail:

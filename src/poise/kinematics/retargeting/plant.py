@@ -48,7 +48,7 @@ class Foot:
 
     @property
     def is_hand(self) -> bool:
-        """Whether it is the end of an arm."""
+        """True for the end of an arm."""
         return self.name.endswith("hand")
 
     def points(self, pos: np.ndarray, quat: np.ndarray, target: bool) -> np.ndarray:

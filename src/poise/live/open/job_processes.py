@@ -84,7 +84,7 @@ class PageJob:
 
 
 def drawn_since(path: Path, row: int) -> bytes:
-    """What a job has simulated, see `preview.Preview`: the header, and the rows from one on."""
+    """Frames that a job has simulated, see `preview.Preview`: the header, and the rows from one on."""
     with path.open("rb") as file:
         first = file.read(4)
         words = file.read(int.from_bytes(first, "little"))

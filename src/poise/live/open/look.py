@@ -13,6 +13,7 @@ import numpy as np
 from poise.formats import home_suffix
 from poise.formats.text import write_whole
 from poise.kinematics import anatomy_of, examine, find_guesses, support_of
+from poise.kinematics.forward import carried
 from poise.kinematics.repair.faults import KINDS
 from poise.kinematics.repair.needs import not_alone
 from poise.motion import Clip, find_roles, ground_shift
@@ -89,7 +90,7 @@ def headed(header: dict[str, Any]) -> bytes:
 def places_of(clip: Clip) -> np.ndarray:
     """Places `(T, J, 3)` m, Z up, of joints and, after them, of bone tips."""
     pos, quat = clip.world()
-    tips = (_carried(pos[:, j], quat[:, j], end)[:, None] for j, end in _tips(clip))
+    tips = (carried(pos[:, j], quat[:, j], end)[:, None] for j, end in _tips(clip))
     return np.concatenate([pos, *tips], 1)
 
 
@@ -99,12 +100,6 @@ def _tips(clip: Clip) -> list[tuple[int, np.ndarray]]:
 
 def _sided(roles: dict[int, Any], joint: int) -> bool:
     return joint in roles and bool(roles[joint].side)
-
-
-def _carried(pos: np.ndarray, quat: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """A tip `end (3)` m in the frame of a joint at `pos (T, 3)`, `quat (T, 4)` wxyz, in the world."""
-    turn = 2.0 * np.cross(quat[:, 1:], end)
-    return pos + end + quat[:, :1] * turn + np.cross(quat[:, 1:], turn)
 
 
 def judged(clip: Clip) -> dict[str, Any]:

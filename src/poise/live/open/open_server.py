@@ -59,7 +59,7 @@ _REPORT = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
 )
 _FETCHED = re.compile(r"/(figure|judged|report|export)/([0-9a-z]{1,16})")
-#: What a job has simulated so far, from a row on.
+#: Address of the frames that a job has simulated so far, from a row on.
 _DRAWN = re.compile(r"/drawn/([0-9]{1,9})/([0-9]{1,9})")
 
 
@@ -94,7 +94,7 @@ class OpenServer:
     """
 
     def __init__(self, project: Project, guard: Guard, runs: Runs):
-        # What a job of another page writes would be taken away below.
+        # Files of a job of another page would be taken away below.
         self._lock = ProjectLock(project.folder)
         self.project, self.guard, self._runs = project, guard, runs
         self._events: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""What a job has simulated so far, in a file that the page reads while the job goes on."""
+"""The frames that a job has simulated so far, in a file that the page reads while the job goes on."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Preview:
         self._show(what, done, of)
 
     def begin(self, humanoid: Humanoid, placed: PlacedMotion, frames: int, rate_hz: float) -> None:
-        """See `jobs.track.controllers.Draws`."""
+        """See `jobs.track.controllers.DrawsSteps`."""
         like = placed.clip
 
         def clip(qpos: np.ndarray, at: np.ndarray) -> Clip:
@@ -67,7 +67,7 @@ class Preview:
             self._path.write_bytes(headed(header))
 
     def draw(self, frame: int, qpos: np.ndarray) -> None:
-        """See `jobs.track.controllers.Draws`."""
+        """See `jobs.track.controllers.DrawsSteps`."""
         if frame % self._step:
             return
         self._rows.append(np.array(qpos))

@@ -52,7 +52,7 @@ function decodeFigure(buffer) {
     },
   };
 }
-// What a job has simulated so far: the same, of frames that come one after another.
+// The frames that a job has simulated so far: the same, of frames that come one after another.
 function growingFigure() {
   let head = null, data = null, J = 0, have = null, low = Infinity, high = -1;
   const figure = {

@@ -40,7 +40,7 @@ function timelineView(canvas, acts) {
       ink.fillRect(a - 1, 0, 2, h);
       ink.fillRect(b - 1, 0, 2, h);
     }
-    // What is simulated so far.
+    // The part that is simulated so far.
     if (state.made) {
       ink.fillStyle = css("--sim");
       ink.fillRect(toX(state.made[0]), RULER - 4, Math.max(toX(state.made[1]) - toX(state.made[0]), 2), 3);
