@@ -328,6 +328,12 @@ def _stem(file: Path) -> str:
     return file.parent.name if file.stem == "model" else file.stem
 
 
+def limits() -> str:
+    """The list of `results.md`, for the README."""
+    page = (DOCS / "results.md").read_text("utf-8")
+    return page.split("## What it does not do\n")[1].split("\n## ")[0].strip()
+
+
 CODE: dict[str, Callable[[], str]] = {
     "verbs": verbs,
     "api": api,
@@ -336,6 +342,7 @@ CODE: dict[str, Callable[[], str]] = {
     "commands": commands,
     "verdicts": verdicts,
     "shipped": shipped,
+    "limits": limits,
 }
 
 

@@ -6,10 +6,12 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
-import structure
+import grimp
 
 from poise import __file__ as package
 
@@ -20,18 +22,21 @@ ALWAYS = ("__init__.py", "errors.py", "settings.py", "version.py")
 
 
 def test_no_module_imports_itself_over_others() -> None:
-    source = Path(package).parent
-    trees = {p: ast.parse(p.read_text("utf-8")) for p in sorted(source.rglob("*.py"))}
-    assert [structure.cycles(graph) for graph in structure.imports(source, trees)] == [[], []]
+    graph = grimp.build_graph("poise", exclude_type_checking_imports=True, cache_dir=None)
+    imported = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    assert len(imported) > 100
+    TopologicalSorter(imported).prepare()  # raises CycleError
 
 
 def test_a_file_shares_its_name_with_no_other() -> None:
     """But a verb's command line with its job: `cli/push.py` and `jobs/push.py`."""
-    source = Path(package).parent
-    trees = {p: ast.parse(p.read_text("utf-8")) for p in sorted(source.rglob("*.py"))}
-    repeated, verbs = structure.repeated_files(source, trees)
-    assert repeated == {}
-    assert "push" in verbs
+    source, places = Path(package).parent, defaultdict(set)
+    for path in source.rglob("*.py"):
+        if path.name != "__init__.py":
+            places[path.name].add(path.parent.relative_to(source).as_posix())
+    verbs = {name for name, folders in places.items() if folders == {"cli", "jobs"}}
+    assert [name for name, folders in places.items() if len(folders) > 1 and name not in verbs] == []
+    assert "push.py" in verbs
 
 
 def test_public_modules_are_checked_strictly() -> None:
