@@ -13,6 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 
+import poise
+from poise.body import Humanoid
+from poise.env import Frame, RewardTerm
+from poise.errors import PoiseError
 from poise.jobs.runs import begin, train
 from poise.learn import PPOConfig, Until, load_checkpoint
 from poise.motion import ClipLibrary
@@ -78,3 +82,31 @@ def test_killed_runs_end_like_the_uninterrupted_one(tmp_path: Path) -> None:
     assert a.keys() == b.keys()
     different = [k for k in a if not torch.equal(a[k], b[k])]
     assert not different
+
+
+def _low_hands(frame: Frame, bodies: torch.Tensor) -> torch.Tensor:
+    return torch.exp(-frame.sim.pos.index_select(1, bodies)[..., 2].mean(-1))
+
+
+def _own_rewards(body: Humanoid) -> list[RewardTerm]:
+    hands = torch.tensor(body.rows_of("hand"))
+    return [RewardTerm("low_hands", _low_hands, 0.5, {"bodies": hands}, imitation=False)]
+
+
+def test_rewards_of_a_program_leave_a_run_that_opens(tmp_path: Path) -> None:
+    """And nobody goes on with it without them."""
+    ppo = PPOConfig(horizon=4, minibatch=16, policy_hidden=(8,))
+    small = {"num_envs": 8, "expert": False, "ppo": ppo}
+    heard: list[float] = []
+
+    def tell(stats: poise.learn.IterationStats) -> None:
+        heard.append(stats.terms["reward/low_hands"])
+
+    clip = swing(1.0)
+    how = {"iterations": 1, "folder": tmp_path, "threads": 1, "on_iteration": tell}
+    made = poise.imitate(clip, rewards=_own_rewards, **how, **small)
+    assert 0 < heard[0] < 1
+    assert made.run is not None
+    assert poise.open_run(tmp_path).score().succ == made.card.succ
+    with pytest.raises(PoiseError, match="low_hands"):
+        poise.imitate(clip, **how, **small)

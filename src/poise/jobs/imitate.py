@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from poise.body import Humanoid
+from poise.env import RewardTerm
 from poise.errors import PoiseError
 from poise.jobs.keep import EVALUATING, claimed
 from poise.jobs.open import Run, open_run
@@ -48,6 +50,7 @@ def imitate(
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     callbacks: TrainingCallbacks | None = None,
     in_place: Mode = "auto",
+    rewards: Callable[[Humanoid], Sequence[RewardTerm]] | None = None,
     **settings: Any,
 ) -> Result:
     """Trains a policy on a motion, simulates it from every start frame, and scores it.
@@ -72,6 +75,8 @@ def imitate(
         callbacks: are told what happens before PPO begins, where nothing is there to begin with.
         in_place: what becomes of a clip in place, see `track.in_place`; what is
             learned from nothing keeps its travel.
+        rewards: makes further rewards for the body; the motion is learned from nothing then. The run
+            folder has their names alone: whatever goes on with it gives them again.
 
     Raises:
         PoiseError: a motion that cannot be read or has no human body, an unknown setting, a folder that
@@ -79,7 +84,7 @@ def imitate(
     """
     until = _limit(minutes, iterations)
     several = [clip] if isinstance(clip, Clip | str | Path) else list(clip)
-    stated = config is not None or set(settings) - {"seed"} or callbacks is not None
+    stated = bool(config or set(settings) - {"seed"} or callbacks or rewards)
     if policy is not None and (stated or len(several) > 1):
         what = "several clips are" if len(several) > 1 else "settings of the recipe are for what is"
         raise PoiseError(
@@ -94,9 +99,10 @@ def imitate(
         beginning=lambda _: callbacks,
         stats=on_iteration,
     )
-    job = Job(lambda: [clip_of(c) for c in several], run, config, until, threads, device, in_place, told)
+    how = (run, config, until, threads, device, in_place, told)
+    job = Job(lambda: [clip_of(c) for c in several], *how, rewards=rewards)
     try:
-        made = job.done(policy, bool(stated) or len(several) > 1)
+        made = job.done(policy, stated or len(several) > 1)
     except BaseException:
         if folder is None:
             shutil.rmtree(run, ignore_errors=True)
@@ -130,7 +136,7 @@ class Job:
     Attributes:
         read: gives the clips, a single one where a policy begins.
         run: the run folder.
-        config, until, threads, device, in_place, told: see `imitate` and `Watching`.
+        config, until, threads, device, in_place, told, rewards: see `imitate` and `Watching`.
         attended: by a user at a terminal: processes of `torchrun` train together, what Ctrl-C ended is
             not evaluated, and the curve is kept for TensorBoard as well.
     """
@@ -144,6 +150,7 @@ class Job:
     in_place: Mode = "auto"
     told: Watching = field(default_factory=Watching)
     attended: bool = False
+    rewards: Callable[[Humanoid], Sequence[RewardTerm]] | None = None
 
     def done(
         self, policy: Tracker | Run | str | Path | None = None, nothing: bool = False
@@ -230,7 +237,7 @@ class Job:
                 library = self._travelling()
                 self.told.given(library)
                 with self.told.doing("making the body"), claimed(self.run):
-                    task = begin(self.run, library, self.config, self.device)
+                    task = begin(self.run, library, self.config, self.device, self.rewards)
                 self.told.begun(task)
         with together(comm):
             return task or open_run(self.run).task

@@ -69,11 +69,13 @@ class RunMeta(_Run, total=False):
 
     source: where the clips are from. character: the identity of the body. earlier: what the policy had
     cost from which the run went on, and table its body. body: that of the run, with the names of the
-    clips that are learned; runs of earlier versions are without.
+    clips that are learned; runs of earlier versions are without. rewards: names of those that a program
+    gave.
     """
 
     recipe: str
     source: str
+    rewards: list[str]
     character: str
     earlier: _Earlier
     table: dict[str, Any]

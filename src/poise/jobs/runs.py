@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from poise.env import Acts, ImitationEnv
+from poise.body import Humanoid
+from poise.env import Acts, ImitationEnv, RewardTerm
 from poise.errors import PoiseError
 from poise.jobs.deliver import Evaluation
 from poise.jobs.run_file import (
@@ -52,15 +53,26 @@ from poise.score import (
 from poise.settings import to_data
 
 
-def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str = "cpu") -> Imitation:
+def begin(
+    folder: Path,
+    library: ClipLibrary,
+    config: ResidualForce,
+    device: str = "cpu",
+    rewards: Callable[[Humanoid], Sequence[RewardTerm]] | None = None,
+) -> Imitation:
     """Builds the task and writes the run file; a folder that holds another run is refused, and so are
-    more characters than fit into the memory of the `device` that will train it."""
+    more characters than fit into the memory of the `device` that will train it.
+
+    rewards: further ones, made for the body. The run file has their names, and no more of them.
+    """
     held = (folder / RUN_FILE).exists()
     file = held_run(folder, RECIPE["name"], config, config_of, library) if held else None
     imitation = build(library, config)
     imitation.check(config.num_envs, device)
+    terms = tuple(rewards(imitation.humanoid)) if rewards else ()
+    names = [term.name for term in terms]
     if file is None:
-        meta = {"recipe": RECIPE["name"], "config": to_data(config)}
+        meta = {"recipe": RECIPE["name"], "config": to_data(config), "rewards": names}
         write_run(folder, library, meta | body_facts(imitation.humanoid, imitation.library.names))
     elif file.meta.get("character") != imitation.humanoid.identity:
         raise PoiseError(
@@ -69,7 +81,14 @@ def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str
             "Choose another folder",
             code="bodies-differ",
         )
-    return imitation
+    elif (known := file.meta.get("rewards", [])) != names:
+        raise PoiseError(
+            f"the run was begun with the rewards {known or 'of its recipe'} of a program, not {names}",
+            folder,
+            "Go on with `poise.imitate(..., rewards=...)` and the same ones",
+            code="settings-differ",
+        )
+    return replace(imitation, task=replace(imitation.task, rewards=(*imitation.task.rewards, *terms)))
 
 
 def train(
