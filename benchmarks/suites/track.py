@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -19,6 +20,7 @@ from benchmarks.common.field import TRIALS, chunks, episodes, figures, measured
 from benchmarks.common.rows import Figure, mean_of, of
 from benchmarks.common.runner import Part, Raws
 from poise.body import generate_table
+from poise.env.pushes import Pushes
 from poise.errors import PoiseError
 from poise.formats.raw import ReadOptions
 from poise.jobs.open import open_run
@@ -32,8 +34,11 @@ from poise.motion.noise import robustness_levels
 
 #: Clips that are simulated side by side.
 AT_ONCE = 16
+EXACT = TRIALS[:1]
 #: m, of people; a second is that of a walk's.
 HEIGHTS_M = (1.16, 1.33, 1.5, 1.67, 1.83, 2.0)
+#: Of a blow every two seconds.
+PUSH_N, PUSH_S = 150.0, 0.1
 STRENGTHS = (0.0, 0.25, 0.5, 1.0, 2.0)
 METHODS = {
     "policy alone": ("tracker", True),
@@ -128,6 +133,29 @@ def noisy_rows(places: Places, raws: Raws) -> Iterator[Figure]:
         yield from of(subject, {"done" if m == "succ" else m: v for m, v in numbers.items()}, len(rows))
 
 
+def pushed(places: Places, unit: str) -> Any:
+    """One group of clips, pushed at the chest in four drawn horizontal directions each time anew."""
+    tracker = policy_of("tracker")
+    clips = chunks(names_of(places, "bandai")[::2], AT_ONCE)[unit]
+    task = imitation_of(tracker, [place(clip_of(places, "bandai", c), tracker) for c in clips])
+    chest, hz = task.humanoid.rows_of("spine")[-1], tracker.config.sim.control_hz
+    out = []
+    for seed in TRIALS:
+        blows = Pushes((PUSH_N, PUSH_N), (2.0 - PUSH_S, 2.0 - PUSH_S), PUSH_S, (chest,), hz, seed)
+        own = replace(task, task=replace(task.task, events=(*task.task.events, blows)))
+        out += measured(own, tracker.policy, EXACT)
+    return {"episodes": out}
+
+
+def pushed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Success and errors of all episodes."""
+    rows = [e for raw in raws.values() for e in raw["episodes"]]
+    subject = (
+        f"{SETS['bandai'].title}, every other clip, four times, {PUSH_N:g} N for {PUSH_S:g} s every 2 s"
+    )
+    yield from figures(f"{subject}; policy alone", rows)
+
+
 def sized(clip: Clip, height_m: float) -> Clip:
     """A clip of a person as tall as that, who does the same in the same time."""
     factor = height_m / generate_table(clip.skeleton, None, [clip]).height_m
@@ -208,7 +236,6 @@ def hour_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     yield from of(subject, found, found["clips"])
 
 
-EXACT = TRIALS[:1]
 PARTS = {
     "bandai, policy": set_part("bandai", "policy alone", TRIALS, 0.3),
     "bandai, keypoints": set_part("bandai", "policy of keypoints alone", TRIALS, 0.3),
@@ -235,6 +262,14 @@ PARTS = {
         lambda p: names_of(p, "bandai")[::7],
         noisy,
         noisy_rows,
+        ("tracker",),
+        hours=0.1,
+    ),
+    "pushes": Part(
+        "blows to the chest",
+        lambda p: list(chunks(names_of(p, "bandai")[::2], AT_ONCE)),
+        pushed,
+        pushed_rows,
         ("tracker",),
         hours=0.1,
     ),
