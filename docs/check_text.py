@@ -12,7 +12,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from generate import DOCS, by_hand
+from generate import DOCS, by_hand, generated
 
 #: Pages of the site; words of a page and of all pages, without what is generated; words and lines of the
 #: README; words of the change log.
@@ -25,7 +25,7 @@ _CODE = (
     re.compile(r"\]\([^)]*\)"),
     re.compile(r"<!--.*?-->", re.DOTALL),
     # Names that hold a number.
-    re.compile(r"Apache License 2\.0|CC0 1\.0"),
+    re.compile(r"Apache License 2\.0|CC0 1\.0|Sec(?:\.|tion) \d+(?:\.\d+)*"),
 )
 _UNITS = (
     r"%|percent|mm|cm|dm|m|km|ms|s|min|minutes?|hours?|days?|weeks?|seconds?|k?Hz|N|J|W|kg|g|rad|degrees?|°|kB|MB|GB|[KMG]iB|"
@@ -64,6 +64,12 @@ def problems() -> list[str]:
         out.append(f"docs: {len(pages)} pages, at most {PAGES}")
     if sum(counts.values()) > ALL_WORDS:
         out.append(f"docs: {sum(counts.values())} words, at most {ALL_WORDS}")
+    # READMEs of the papers, as long as pages; neither pages of the site nor of its words.
+    beside = {
+        p.relative_to(root).as_posix(): p.read_text("utf-8") for p in generated() if "src" in p.parts
+    }
+    texts |= beside
+    counts |= {name: words(text) for name, text in beside.items()}
     out += [f"{name}: {n} words, at most {PAGE_WORDS}" for name, n in counts.items() if n > PAGE_WORDS]
     readme, log = ((root / name).read_text("utf-8") for name in ("README.md", "CHANGELOG.md"))
     texts |= {"README.md": readme, "CHANGELOG.md": log}

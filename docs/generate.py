@@ -21,6 +21,8 @@ from typing import Any
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent / "src")]
 
+from claims import RULE, paper_markdown  # noqa: E402
+from paper_tables import PAPER_TABLES  # noqa: E402
 from tables import TABLES, Results, markdown  # noqa: E402
 
 MARK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -324,6 +326,13 @@ def shipped() -> str:
     return "\n".join(rows)
 
 
+def generated() -> list[Path]:
+    """The documents that have blocks: the README, the pages, and the READMEs of the papers."""
+    root = DOCS.parent
+    papers = root / "src" / "poise" / "papers"
+    return [root / "README.md", *sorted(DOCS.glob("*.md")), *sorted(papers.glob("*/README.md"))]
+
+
 def _stem(file: Path) -> str:
     return file.parent.name if file.stem == "model" else file.stem
 
@@ -343,6 +352,7 @@ CODE: dict[str, Callable[[], str]] = {
     "verdicts": verdicts,
     "shipped": shipped,
     "limits": limits,
+    "verdict-rule": lambda: RULE,
 }
 
 
@@ -355,7 +365,10 @@ def filled(page: str, results: Results) -> str:
 
     def block(found: re.Match[str]) -> str:
         name = found[2]
-        made = markdown(TABLES[name], results) if name in TABLES else CODE[name]()
+        if name in PAPER_TABLES:
+            made = paper_markdown(PAPER_TABLES[name], results)
+        else:
+            made = markdown(TABLES[name], results) if name in TABLES else CODE[name]()
         return f"{found[1]}\n{made}\n\n{found[3]}"
 
     return MARK.sub(block, page)
@@ -370,11 +383,11 @@ def main(argv: list[str] | None = None) -> int:
     """Writes the pages, or with --check names those that are not current."""
     check = "--check" in (sys.argv[1:] if argv is None else argv)
     results, stale = Results.read(), []
-    for page in [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]:
+    for page in generated():
         before = page.read_text("utf-8")
         after = filled(before, results)
         if after != before:
-            stale.append(page.name)
+            stale.append(page.relative_to(DOCS.parent).as_posix())
             if not check:
                 page.write_text(after, "utf-8")
     if stale:

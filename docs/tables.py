@@ -50,10 +50,17 @@ class Table:
 
 @dataclass
 class Results:
-    """All rows of `results/*.csv` by suite, subject and metric; of several the last one counts."""
+    """All rows of `results/*.csv` by suite, subject and metric; of several the last one counts.
+
+    Attributes:
+        rows: each with its suite.
+        ships: the digest of each policy that ships, by name.
+        steps: control steps that policies learned from, by digest.
+    """
 
     rows: dict[tuple[str, str, str], dict[str, str]] = field(default_factory=dict)
     ships: dict[str, str] = field(default_factory=dict)
+    steps: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def read(cls, folder: Path = RESULTS) -> Results:
@@ -65,9 +72,11 @@ class Results:
                 # The last policy of a file is the one that ships.
                 latest = {row["file"]: row for row in rows}
                 found.ships = {row["policy"]: row["digest"] for row in latest.values()}
+                learned = {row["digest"]: row["control_steps"] for row in rows}
+                found.steps = {digest: float(steps) for digest, steps in learned.items() if steps}
                 continue
             for row in rows:
-                found.rows[file.stem, row["subject"], row["metric"]] = row
+                found.rows[file.stem, row["subject"], row["metric"]] = row | {"suite": file.stem}
         return found
 
     def older(self, policy: str) -> list[str]:

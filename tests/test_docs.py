@@ -11,6 +11,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,8 @@ def _script(name: str) -> ModuleType:
     return module
 
 
-tables, generate = _script("tables"), _script("generate")
+tables, claims = _script("tables"), _script("claims")
+paper_tables, generate = _script("paper_tables"), _script("generate")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 WALK = ROOT / "src" / "poise" / "data" / "walk.bvh"
 
@@ -205,6 +207,7 @@ def test_pages_are_short_and_state_no_figures() -> None:
         ("Frames 0, 30 and 60 are keyframes, ten minutes each.", 0),
         ("<!-- table: unseen -->\n\n| 97 % | 3.2 mm |\n\n<!-- end -->", 0),
         ("    poise imitate walk.bvh --minutes 10  # 10 minutes", 0),
+        ("As Sec. 4.1 and Section 5.2.1 say, 4.1 mm off.", 1),
     ],
 )
 def test_figures_in_prose_are_found(prose: str, found: int) -> None:
@@ -236,3 +239,145 @@ def test_a_table_without_its_row_is_an_error() -> None:
 )
 def test_numbers_are_written_as_their_column_says(value: str, form: str, text: str) -> None:
     assert tables.written(value, form) == text
+
+
+def _results(*rows: tuple[str, str, float, str, int, int, str]) -> Any:
+    """Made-up rows: subject, metric, value, spread, n, seeds, policy."""
+    made = tables.Results(ships={"tracker-v2": "2" * 16}, steps={"2" * 16: 4e8})
+    names = ("subject", "metric", "value", "spread", "n", "seeds", "policy")
+    for row in rows:
+        told = {k: str(v) for k, v in zip(names, row, strict=True)}
+        suite = "published" if told["policy"] == "published" else "papers"
+        told |= {"suite": suite, "command": "python x.py", "commit": "abc"}
+        made.rows[suite, row[0], row[1]] = told
+    return made
+
+
+_V = claims.Value
+
+
+@pytest.mark.parametrize(
+    ("says", "sign", "ours", "other", "told"),
+    [
+        # Intervals that do not meet, in the paper's sense and against it.
+        ("better", -1, _V(1.0, 0.9, 1.1), _V(2.0, 1.8, 2.2), "shown"),
+        ("better", 1, _V(1.0, 0.9, 1.1), _V(2.0, 1.8, 2.2), "the other way"),
+        ("worse", 1, _V(1.0, 0.9, 1.1), _V(2.0, 1.8, 2.2), "shown"),
+        ("better", -1, _V(1.0, 0.9, 1.9), _V(2.0, 1.8, 2.2), "not shown (intervals meet)"),
+        ("better", -1, _V(1.0), _V(2.0, 1.8, 2.2), "not shown (no interval)"),
+        ("better", -1, None, _V(2.0, 1.8, 2.2), "not run"),
+        ("better", -1, _V(1.0, 0.9, 1.1), None, "not run"),
+        # Two seeds must lie farther apart than the wider range is wide, three need not.
+        ("better", -1, _V(1.0, 0.9, 1.1, 2), _V(1.4, 1.2, 1.6, 2), "not shown (intervals meet)"),
+        ("better", -1, _V(1.0, 0.9, 1.1, 2), _V(2.0, 1.8, 2.2, 2), "shown"),
+        ("better", -1, _V(1.0, 0.9, 1.1, 3), _V(1.4, 1.2, 1.6, 3), "shown"),
+        # The paper's own figure is one point.
+        ("reaches", 1, _V(0.97, 0.95, 0.99), _V(0.95, 0.95, 0.95), "shown"),
+        ("reaches", 1, _V(0.97, 0.95, 0.99), _V(0.96, 0.96, 0.96), "not shown (intervals meet)"),
+        ("reaches", 1, _V(0.97, 0.95, 0.99), _V(0.995, 0.995, 0.995), "the other way"),
+        # The whole difference within a tenth, partly, not at all.
+        ("alike", 1, _V(1.0, 0.99, 1.01), _V(1.0, 0.98, 1.02), "shown"),
+        ("alike", 1, _V(1.0, 0.8, 1.2), _V(1.0, 0.98, 1.02), "not shown (too wide)"),
+        ("alike", 1, _V(2.0, 1.9, 2.1), _V(1.0, 0.98, 1.02), "the other way"),
+    ],
+)
+def test_a_verdict_follows_from_the_intervals(
+    says: str, sign: int, ours: Any, other: Any, told: str
+) -> None:
+    assert claims.verdict(says, sign, ours, other) == told
+
+
+def test_intervals_are_those_of_their_rows() -> None:
+    share, plain = claims.share("done", "done"), claims.Measure("off", "off", "1", -1)
+
+    def of(*rows: tuple[float, str, int, int], measure: Any = plain) -> Any:
+        texts = [
+            {"value": str(v), "spread": spread, "n": str(n), "seeds": str(seeds)}
+            for v, spread, n, seeds in rows
+        ]
+        return claims.value_of(texts, measure)
+
+    assert of() is None
+    assert not of((3.0, "", 40, 1)).known
+    assert of((3.0, "2.5 to 1e+01", 40, 1)) == _V(3.0, 2.5, 10.0, 0)
+    assert of((3.0, "2 to 4", 40, 2)) == _V(3.0, 2.0, 4.0, 2)
+    assert of((3.0, "-1 to 4", 40, 1)).low == -1.0
+    assert of((3.0, "+- 0.5", 40, 1)) == _V(3.0, 2.0, 4.0, 0)
+    assert of((3.0, "", 40, 1), (4.0, "", 40, 1), (8.0, "", 40, 1)) == _V(5.0, 3.0, 8.0, 3)
+    # Wilson's interval of 19 of 20.
+    found = of((0.95, "", 20, 1), measure=share)
+    assert (round(found.low, 3), round(found.high, 3)) == (0.764, 0.991)
+    assert not of((1.0, "", 1, 1), measure=share).known
+
+
+def test_a_papers_table_stands_beside_ours() -> None:
+    measures = (claims.share("done", "done"), claims.Measure("off, mm", "off", "1", -1))
+    table = claims.PaperTable(
+        measures,
+        (
+            claims.Claim("theirs", "papers:b, seed *", paper="P; b"),
+            claims.Claim("ours", "papers:a, seed *", "better", "papers:b, seed *", "theirs", "P; a"),
+            claims.Claim("older", "papers:c", "better", "papers:a, seed 0", "ours"),
+            claims.Claim("never tried", "papers:d", "better", "papers:b, seed *", "theirs"),
+            claims.Claim("gone", "papers:e", optional=True),
+        ),
+        "python -m benchmarks papers",
+        "P; any",
+    )
+    now, before = f"tracker-v2 {'2' * 16}", f"tracker-v1 {'1' * 16}"
+    trained = "a (trained for this table)"
+    results = _results(
+        ("P; a", "done", 0.9, "", 140, "", "published"),
+        ("P; any", "samples", 75e6, "", "", "", "published"),
+        *((f"a, seed {k}", "done", 0.9 + k / 100, "", 20, 1, now) for k in range(3)),
+        *((f"a, seed {k}", "off", 30.0 + k, "", 20, 1, now) for k in range(3)),
+        *((f"b, seed {k}", "done", 0.5 + k / 100, "", 20, 1, trained) for k in range(3)),
+        *((f"b, seed {k}", "off", 31.0 + k, "", 20, 1, trained) for k in range(3)),
+        ("c", "done", 0.2, "0.1 to 0.3", 20, 1, before),
+    )
+    text = claims.paper_markdown(table, results)
+    theirs, ours, older, never = [row.split(" | ") for row in text.splitlines()[2:6]]
+    assert theirs[-1] == "- |" and theirs[-2] == "trained for this table"
+    assert ours[0] == "| ours: better than theirs" and ours[1] == "90 %; -"
+    assert ours[2] == "91 % (90 to 92); 31.0 (30.0 to 32.0)"
+    assert ours[4:8] == ["20", "3", "400 million", "tracker-v2"]
+    assert ours[-1] == "shown: done; not shown (intervals meet): off |"
+    assert older[-2] == "of tracker-v1, not what ships"
+    assert older[-1] == "not shown (other policies): done; not run: off |"
+    assert never[2] == "not run: `python -m benchmarks papers`" and never[-1] == "not run |"
+    assert "gone" not in text and "The paper: 75 million control steps" in text
+    assert text.endswith("    python x.py  # abc")
+
+
+def test_clips_are_compared_in_pairs() -> None:
+    results = _results(
+        *((f"{c}; a", "off", v, "", 1, 1, "") for c, v in (("x", 5.0), ("y", 8.0), ("z", 2.0))),
+        *((f"{c}; b", "off", v, "", 1, 1, "") for c, v in (("x", 6.0), ("y", 9.1), ("z", 3.1))),
+    )
+    claim = claims.Claim("a", "papers:{}; a", "better", "papers:{}; b", "b", over=("x", "y", "z", "w"))
+    table = claims.PaperTable((claims.Measure("off", "off", "1", -1),), (claim,))
+    row = claims.paper_markdown(table, results).splitlines()[2].split(" | ")
+    assert row[2] == "-1.1 (-1.2 to -0.9)" and row[4] == "3 pairs" and row[-1] == "shown |"
+
+
+def test_rows_of_papers_name_what_is_there() -> None:
+    """Papers' rows are in `published.csv`; commands are of a suite and a part, which makes rows."""
+    from benchmarks.__main__ import arguments
+    from benchmarks.common.runner import parts_of
+
+    results = tables.Results.read()
+    printed = {subject for suite, subject, _ in results.rows if suite == "published"}
+    for name, table in paper_tables.PAPER_TABLES.items():
+        for claim in table.claims:
+            assert not claim.paper or claim.paper in printed, f"{name}: {claim.paper}"
+            command = table.run if claim.run is None else claim.run
+            if command:
+                told = arguments().parse_args(shlex.split(command)[3:])
+                parts = parts_of(told.suite)
+                assert all(any(p.startswith(o) for p in parts) for o in told.only), command
+    known = {name for page in generate.generated() for name in _marked(page)}
+    assert {*paper_tables.PAPER_TABLES} <= known
+
+
+def _marked(page: Path) -> list[str]:
+    return re.findall(r"<!-- table: ([\w-]+) -->", page.read_text("utf-8"))
