@@ -191,20 +191,26 @@ def thrown(places: Places, unit: str) -> Any:
     out["goal_moved_mm"] = (1000 * np.nanmean(found.moved, 1)).tolist()
     for name in ("impulse", "peak", "torque"):
         values = getattr(found, name)
-        out[f"{name}_ratio"] = np.nanmean(values / values[:1], 1).tolist()
+        ratio = values / values[:1]
+        error = 1.96 * np.nanstd(ratio, 1, ddof=1) / np.sqrt(np.isfinite(ratio).sum(1))
+        middle = np.nanmean(ratio, 1)
+        out[f"{name}_ratio"] = np.stack((middle, middle - error, middle + error), 1).tolist()
         if law != "stiffness" and not places.smoke:
             out[f"{name}_slope"] = list(slope(levels, values))
     return out
 
 
 def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
-    """Ratios to the first level; the slope over levels with its interval of 95 %."""
+    """Ratios of each throw to the first level's, and their slope over levels, with intervals of 95 %."""
     for unit, raw in raws.items():
         words = "{:g} N/m" if unit.startswith("stiffness") else "level {:g}"
         for k, level in enumerate(raw["levels"]):
-            names = ("impulse_ratio", "peak_ratio", "torque_ratio", "fell", "goal_moved_mm")
-            values = {n: raw[n][k] for n in names}
-            yield from of(f"throws, {unit}, {words.format(level)}", values, raw["throws"])
+            subject, many = f"throws, {unit}, {words.format(level)}", raw["throws"]
+            for name in ("impulse_ratio", "peak_ratio", "torque_ratio"):
+                middle, low, high = raw[name][k]
+                yield Figure(subject, name, middle, many, f"{short(low)} to {short(high)}")
+            values = {n: raw[n][k] for n in ("fell", "goal_moved_mm")}
+            yield from of(subject, values, many)
         for name in ("impulse", "peak", "torque"):
             if f"{name}_slope" in raw:
                 middle, low, high = raw[f"{name}_slope"]
