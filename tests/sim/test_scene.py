@@ -198,6 +198,24 @@ def test_a_ball_that_is_thrown_and_its_impulse() -> None:
     assert float(sim.touch("hit").force[0].norm()) == 0.0
 
 
+def test_a_soft_box_hits_less_hard_than_a_hard_one() -> None:
+    """The same box falls as far onto the floor: the force is smaller, the time longer, the impulse alike."""
+    peaks, impulses = [], []
+    for soft in (0.0, 0.1):
+        box = Box("bag", (0.3, 0.3, 0.3), (0, 0, 0.35), mass=40.0, soft_s=soft)
+        fine = SimConfig(rate_hz=600.0, integrator="implicitfast")
+        sim = SceneSim(Scene((box,), touches=(Touch("hit", "bag", "floor"),), sim=fine), 1, threads=1)
+        forces = []
+        for _ in range(600):
+            sim.step()
+            forces.append(float(sim.touch("hit").force[0].norm()))
+        peaks.append(max(forces))
+        impulses.append(sum(forces) / 600.0)
+    assert peaks[1] < 0.5 * peaks[0]
+    # Both lie still after a second: what was hit is what gravity gave.
+    assert impulses == pytest.approx([40.0 * G] * 2, rel=0.05)
+
+
 def test_a_door_opens_on_its_hinge() -> None:
     sim = SceneSim(Scene((Door(mass=20.0, width=0.9, damping=0.0, friction=0.0),)), 1, threads=1)
     door = sim.scene.place("door")

@@ -57,6 +57,8 @@ class Box(Checked):
         pos: m, its centre at first.
         quat: wxyz, box to world at first.
         mass: kg; 0 fixes it to the world.
+        soft_s: s, time constant of its contacts (MuJoCo's `solref`, with an impedance of a half), as of a
+            cushion or a punching bag; 0 leaves it as hard as everything else.
     """
 
     name: str = "box"
@@ -64,13 +66,18 @@ class Box(Checked):
     pos: Vector = (0.0, 0.0, 0.2)
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     mass: NotNegative = 0.0
+    soft_s: Annotated[float, Range(0, 1, unit="s")] = 0.0
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body."""
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos), quat=list(self.quat))
         if self.mass:
             body.add_freejoint(name=self.name)
-        solid(body, self.name, "box", [s / 2 for s in self.size], mass=self.mass)
+        geom = solid(body, self.name, "box", [s / 2 for s in self.size], mass=self.mass)
+        if self.soft_s:
+            # Its own softness counts, not a mean with that of what touches it. The half is `scene.FLESH`'s.
+            geom.solref, geom.priority = [self.soft_s, 1.0], 1
+            geom.solimp[:2] = [0.5, 0.5]
 
 
 #: kg; what touches it hardly moves it between two control steps.

@@ -111,6 +111,10 @@ RIVAL = "rival"
 HEAVY_KG, LIGHT_KG = 85.0, 36.0
 
 
+#: s, how soft a punching bag is. A hard one wedges a player that has fallen under it.
+BAG_S = 0.1
+
+
 @dataclass(frozen=True)
 class Chicken:
     """A player hops on one leg and bumps into what weighs as much as its opponent: a punching bag that
@@ -150,7 +154,7 @@ class Chicken:
         chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
-        bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other)
+        bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other, soft_s=BAG_S)
         part = InScene(metered=(hit.name,), felt=felt, events=(far, throw))
         return SceneSetup((bag,), (), touches, (part,), from_start=True)
 
