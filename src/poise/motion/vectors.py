@@ -90,10 +90,27 @@ _CROSS = (
 )  # fmt: skip
 
 
+#: Numbers from which on arrays of NumPy are multiplied component by component. For fewer the passes
+#: cost more than their arithmetic, and one outer product with a small matrix takes their place.
+LARGE = 2000
+
+
+def parts(a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
+    """The components along the last axes of two arrays with leading dimensions that broadcast, and an
+    array for a product as wide as `b`, which lies in memory as they do."""
+    shape, kind = np.broadcast_shapes(a.shape[:-1], b.shape[:-1]) + b.shape[-1:], np.result_type(a, b)
+    alike = next((x for x in (b, a[..., -b.shape[-1] :]) if x.shape == shape), None)
+    out = np.empty(shape, kind) if alike is None else np.empty_like(alike, kind)
+    return [a[..., k] for k in range(a.shape[-1])], [b[..., k] for k in range(b.shape[-1])], out
+
+
 def cross(u: Array, v: Array) -> Array:
     """u x v of vectors `(..., 3)` that broadcast."""
     if isinstance(u, np.ndarray):
-        # NumPy's own takes thirty passes over strided columns.
+        if u.size >= LARGE or v.size >= LARGE:
+            (a, b, c), (x, y, z), out = parts(u, v)
+            out[..., 0], out[..., 1], out[..., 2] = b * z - c * y, c * x - a * z, a * y - b * x
+            return out
         outer = u[..., :, None] * v[..., None, :]
         return outer.reshape(*outer.shape[:-2], 9) @ constant_like(_CROSS, outer)
     import torch
