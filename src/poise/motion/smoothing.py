@@ -247,15 +247,15 @@ def filled(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
 
 
 #: Rows of the blocks in which a banded matrix is solved.
-_BLOCK = 8
+_BLOCK = 16
 
 
 def solve_banded(band: np.ndarray, y: np.ndarray) -> np.ndarray:
     """x `(..., T, C)` with A x = y, for A symmetric, positive definite and in lower banded form
     `(..., W, T)`: row k of the band holds A[t + k, t].
 
-    As a matrix of blocks A has three diagonals, and is eliminated from its first block to its last. SciPy
-    has the same for one matrix, and takes longer to load than a clip takes to be read.
+    As a matrix of blocks A has three diagonals, and is eliminated from its first block to its last.
+    SciPy has the same for one matrix, and takes longer to load than a clip takes to be read.
     """
     lead, (wide, frames), size = band.shape[:-2], band.shape[-2:], max(_BLOCK, band.shape[-2])
     count = -(-frames // size)

@@ -98,9 +98,13 @@ LARGE = 2000
 def parts(a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
     """The components along the last axes of two arrays with leading dimensions that broadcast, and an
     array for a product as wide as `b`, which lies in memory as they do."""
-    shape, kind = np.broadcast_shapes(a.shape[:-1], b.shape[:-1]) + b.shape[-1:], np.result_type(a, b)
-    alike = next((x for x in (b, a[..., -b.shape[-1] :]) if x.shape == shape), None)
-    out = np.empty(shape, kind) if alike is None else np.empty_like(alike, kind)
+    wide, kind = b.shape[-1], np.result_type(a, b)
+    if b.ndim == 1 or b.shape[:-1] == a.shape[:-1]:
+        out = np.empty_like(a[..., :wide], kind)
+    elif a.ndim == 1:
+        out = np.empty_like(b, kind)
+    else:
+        out = np.empty((*np.broadcast_shapes(a.shape[:-1], b.shape[:-1]), wide), kind)
     return [a[..., k] for k in range(a.shape[-1])], [b[..., k] for k in range(b.shape[-1])], out
 
 
