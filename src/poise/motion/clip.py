@@ -15,6 +15,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.motion.rotations import slerp
 from poise.motion.skeleton import Skeleton
+from poise.motion.vectors import norm
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -107,7 +108,7 @@ class Clip:
             raise PoiseError(
                 f"the root position is not finite at frame {frame}", self.name, code="not-finite"
             )
-        norms = np.linalg.norm(self.rot, axis=-1)
+        norms = norm(self.rot)
         if not np.isfinite(norms).all() or np.abs(norms - 1).max() > 1e-4:
             bad = np.argwhere(~(np.abs(norms - 1) <= 1e-4))[0]
             raise PoiseError(

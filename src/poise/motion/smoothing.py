@@ -63,9 +63,8 @@ class Spectrum:
         y = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
         window = np.hanning(frames + 2)[1:-1]
         size = 2 ** math.ceil(math.log2(4 * frames))
-        raw = np.abs(np.fft.rfft(y * window[:, None], size, axis=0)) ** 2 / (window**2).sum()
-        power = np.zeros((len(raw), int(groups.max()) + 1))
-        np.add.at(power.T, groups, raw.T)
+        raw = squared(np.fft.rfft(y * window[:, None], size, axis=0)) / (window**2).sum()
+        power = raw @ (groups[:, None] == np.arange(groups.max() + 1)).astype(float)
         return cls(np.fft.rfftfreq(size, 1 / fps), raw, power, 2.0 * fps / frames, fps)
 
     def near(self, hz: float) -> np.ndarray:
@@ -157,6 +156,11 @@ class Spectrum:
         """The power at the peak of tones of a variance: a sin(2 pi f t) under a Hann window of T frames
         has a^2 T / 6."""
         return np.asarray(variance) * (2.0 / self.width) * self.fps / 3.0
+
+
+def squared(waves: np.ndarray) -> np.ndarray:
+    """|z|^2 of complex numbers z."""
+    return np.real(waves) ** 2 + np.imag(waves) ** 2
 
 
 def _largest(values: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:

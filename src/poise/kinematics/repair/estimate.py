@@ -43,9 +43,11 @@ from poise.motion.smoothing import (
     only_noise,
     pieces,
     smoothed,
+    squared,
     tremble_of,
     white_mm,
 )
+from poise.motion.vectors import norm
 
 #: A joint that stands still for so long (s) and leaps on by so many of its steps, by this angle (rad) at
 #: least, was held.
@@ -306,7 +308,7 @@ def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
 
 def _rough(places: np.ndarray, n: int) -> np.ndarray:
     """`(T - n, J)` m, differences of an order of joints' places `(T, J, 3)`."""
-    return np.linalg.norm(np.diff(places, n=n, axis=0), axis=-1)
+    return norm(np.diff(places, n=n, axis=0))
 
 
 def _continuous(rot: np.ndarray) -> np.ndarray:
@@ -405,7 +407,7 @@ def _repeats(y: np.ndarray) -> bool:
     """Whether `y (T, C)` is one cycle again and again."""
     frames, y = len(y), y - y.mean(0)
     # |y_t - y_t+P|^2 summed over t, of all P at once.
-    power = (np.abs(np.fft.rfft(y, 2 * frames, axis=0)) ** 2).sum(1)
+    power = squared(np.fft.rfft(y, 2 * frames, axis=0)).sum(1)
     shared = np.fft.irfft(power)[: frames // 2 + 1]
     square = np.concatenate(([0.0], np.cumsum((y**2).sum(1))))
     lag = np.arange(3, frames // 2 + 1)
