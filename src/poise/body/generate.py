@@ -22,6 +22,7 @@ from poise.body.parts import Anatomy, Part, find_anatomy
 from poise.body.shapes import Ruler, geoms_of
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
+from poise.motion.clip import remembered
 from poise.motion.rotations import euler_to_quat, quat_mul, quat_rotate
 from poise.motion.vectors import norm
 from poise.settings import Range, validate
@@ -121,6 +122,12 @@ def generate_table(
         )
     table = BodyTable(tuple(rows), ruler.height, config.friction, _exclusions(rows))
     return table.overridden(dict(config.overrides))
+
+
+@remembered
+def body_of(clip: Clip) -> BodyTable:
+    """The parameters of the body that is made for a clip of its own, see `generate_table`."""
+    return generate_table(clip.skeleton, None, [clip])
 
 
 def is_cmu(skeleton: Skeleton) -> bool:

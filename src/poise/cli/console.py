@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from poise.score import ScoreCard
 
 
+#: Variables by which users ask for colours where no terminal is seen.
+_COLOURS = ("FORCE_COLOR", "TTY_COMPATIBLE")
 #: Columns of a table that goes to a file or a pipe, where no window limits it.
 _PIPE_WIDTH = 120
 
@@ -51,11 +53,25 @@ def rank() -> int:
     return int(os.environ["RANK"]) if launched() else 0
 
 
-def _text(text: str, style: str = "") -> Text:
-    # The help of `poise` alone does without rich, which takes as long as all else together.
-    from rich.text import Text
+def _line(stream: Any, text: str, style: str = "", head: str = "", everywhere: bool = False) -> None:
+    """One line, never wrapped; `head` in red before it.
 
-    return Text(text, style=style)
+    A pipe or a file gets the text alone, without rich, which takes as long to import as a short file
+    takes to be read.
+    """
+    styled = any(os.environ.get(name) for name in _COLOURS)
+    if styled or (hasattr(stream, "isatty") and stream.isatty()):
+        from rich.text import Text
+
+        line = Text.assemble((head, "bold red"), (text, style))
+        _console(stream, everywhere).print(line, soft_wrap=True)
+    elif rank() == 0 or everywhere:
+        stream.write(head + text.expandtabs() + "\n")
+
+
+def _unread(stream: Any) -> bool:
+    """Whether nobody reads what is printed, as beside `--json`."""
+    return getattr(stream, "name", None) == os.devnull
 
 
 def out() -> Console:
@@ -70,12 +86,12 @@ def err() -> Console:
 
 def say(text: str, style: str = "") -> None:
     """One line of result; it is never wrapped, so that paths can be copied."""
-    out().print(_text(printable(text, "\n\t"), style), soft_wrap=True)
+    _line(sys.stdout, printable(text, "\n\t"), style)
 
 
 def tell(text: str, style: str = "") -> None:
     """One line beside the results, on stderr."""
-    err().print(_text(printable(text, "\n\t"), style), soft_wrap=True)
+    _line(sys.stderr, printable(text, "\n\t"), style)
 
 
 def error(sentence: str, everywhere: bool = False) -> None:
@@ -83,12 +99,10 @@ def error(sentence: str, everywhere: bool = False) -> None:
 
     everywhere: of several processes also those speak that are silent otherwise.
     """
-    from rich.text import Text
-
     line = printable(" ".join(sentence.split()))
     if rank():
         line = f"process {rank()}: {line}"
-    _console(sys.stderr, everywhere).print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
+    _line(sys.stderr, line, head="error: ", everywhere=everywhere)
 
 
 def say_json(value: Any) -> None:
@@ -108,6 +122,8 @@ def notes(sentences: Sequence[str], limit: int = 12) -> None:
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> None:
     """A table: its first `left` columns are words, the others are figures."""
+    if _unread(sys.stdout):
+        return
     from rich.table import Table
     from rich.text import Text
 
@@ -142,7 +158,9 @@ def print_card(card: ScoreCard) -> None:
 
 
 def _verdict(word: str) -> Text:
-    return _text(word, _STYLES.get(word, ""))
+    from rich.text import Text
+
+    return Text(word, style=_STYLES.get(word, ""))
 
 
 #: Exit codes beside 0 (done) and 1 (a fault of Poise or of the machine).

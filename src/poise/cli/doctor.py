@@ -16,7 +16,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise import __version__
@@ -83,6 +82,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError(
             "no clip was given", hint="Write poise doctor CLIP --fix -o OUT", code="argument-missing"
         )
+    from rich.text import Text
+
     checks = [check() for check in CHECKS]
     ready = all(c.state != "missing" for c in checks)
     wide = max(len(c.name) for c in checks)

@@ -15,8 +15,8 @@ import shutil
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass
-from types import ModuleType
-from typing import Any, NoReturn, TypeVar, get_type_hints
+from types import ModuleType, UnionType
+from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -49,7 +49,8 @@ def parse(options: Callable[..., T], argv: Sequence[str], prog: str, default: An
 
     try:
         does = about(options)
-        with _told(refuse), whole_lines(does), contextlib.redirect_stderr(io.StringIO()):
+        quiet = contextlib.redirect_stderr(io.StringIO())
+        with _told(refuse), whole_lines(does), plain_types(), quiet:
             how: dict[str, Any] = {"prog": prog, "config": _CONFIG, "default": default}
             if default is None:
                 how.pop("default")
@@ -117,6 +118,33 @@ def whole_lines(kept: str) -> Iterator[None]:
         yield
     finally:
         _strings.remove_single_line_breaks = theirs
+
+
+@contextlib.contextmanager
+def plain_types() -> Iterator[None]:
+    """Has tyro check the defaults of unions and tuples without typeguard, which takes as long to import
+    as tyro itself."""
+    # Private to tyro: without it command lines are the same, and slower.
+    try:
+        from tyro import _resolver
+
+        theirs = _resolver.is_instance
+    except (ImportError, AttributeError):
+        yield
+        return
+
+    def ours(kind: Any, value: Any) -> bool:
+        if isinstance(kind, UnionType):
+            return any(ours(one, value) for one in get_args(kind))
+        if get_origin(kind) is tuple and get_args(kind)[1:] == (...,):
+            return isinstance(value, tuple) and all(ours(get_args(kind)[0], one) for one in value)
+        return theirs(kind, value)
+
+    _resolver.is_instance = ours
+    try:
+        yield
+    finally:
+        _resolver.is_instance = theirs
 
 
 def about(options: Callable[..., Any]) -> str:

@@ -45,49 +45,61 @@ def drop_spikes(positions: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarr
     if frames < 2 * _HALF_WINDOW + 1:
         return positions, spikes
     explained = 0.5 * SPIKE_ACCELERATION * (_HALF_WINDOW / fps) ** 2
-    path = _running_median(positions.reshape(frames, -1), _HALF_WINDOW).reshape(positions.shape)
-    off = np.linalg.norm(positions - path, axis=-1)
-    usual = _running_median(off, max(_HALF_WINDOW, round(0.5 * fps)))
-    limit = np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
+    path = _path(positions.reshape(frames, -1)).reshape(positions.shape)
+    off, limit = np.linalg.norm(positions - path, axis=-1), max(SPIKE_M, explained)
     found = off > limit
+    # Of the others, which are nearly all, nobody asks what is usual there.
+    usual = _medians(off, found, max(_HALF_WINDOW, round(0.5 * fps)))
+    least = np.full_like(off, limit)
+    least[found] = np.maximum(limit, SPIKE_TIMES * usual)
+    found = off > least
     # At the ends nothing tells a spike from a step.
     found[:_HALF_WINDOW] = found[-_HALF_WINDOW:] = False
     for k in np.flatnonzero(found.any(0)):
         # In fast motion a spike bends the median beside it; what lies on the path of the rest stays.
         rest = fill(np.where(found[:, k, None], np.nan, positions[:, k]))
-        spikes[:, k] = found[:, k] & (np.linalg.norm(positions[:, k] - rest, axis=-1) > limit[:, k])
+        spikes[:, k] = found[:, k] & (np.linalg.norm(positions[:, k] - rest, axis=-1) > least[:, k])
     out = positions.copy()
     out[spikes] = np.nan
     return out, spikes
 
 
-def _running_median(x: np.ndarray, half: int) -> np.ndarray:
-    """Median `(T, C)` over frames t - half to t + half (fewer at the ends), NaN skipped."""
+def _path(x: np.ndarray) -> np.ndarray:
+    """Median `(T, C)` over five frames (fewer at the ends), NaN skipped."""
+    middle = slice(_HALF_WINDOW, len(x) - _HALF_WINDOW)
+    missing = np.isnan(x).any()
+    asked = np.ones(x.shape, dtype=bool)
+    asked[middle] = missing
+    out = np.empty_like(x)
+    out[asked] = _medians(x, asked, _HALF_WINDOW)
+    if not missing:
+        a, b, c, d, e = (x[k : len(x) - 4 + k] for k in range(5))
+        # Neither the least nor the largest of four is it: of the two that are left and the fifth the
+        # middle one is.
+        low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+        high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+        out[middle] = np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
+    return out
+
+
+def _medians(x: np.ndarray, asked: np.ndarray, half: int) -> np.ndarray:
+    """Medians `(N)` of `x (T, C)` over frames t - half to t + half (fewer at the ends) where they are
+    `asked (T, C)`, NaN skipped."""
     half = min(half, len(x) - 1)
-    # Long recordings go in pieces, so that the windows of one piece fit into little memory.
-    piece = max(1, _PIECE // (x.shape[1] * (2 * half + 1)))
-    if len(x) > 4 * half > 0 and not np.isnan(x).any():
-        # Of a whole window the middle alone is asked for.
-        inner = np.lib.stride_tricks.sliding_window_view(x, 2 * half + 1, 0)
-        pieces = [
-            np.partition(inner[start : start + piece], half, axis=-1)[..., half]
-            for start in range(0, len(inner), piece)
-        ]
-        first, last = (_running_median(part, half) for part in (x[: 2 * half], x[-2 * half :]))
-        return np.concatenate((first[:half], *pieces, last[half:]))
     padded = np.pad(x, ((half, half), (0, 0)), constant_values=np.nan)
-    out = np.full_like(x, np.nan)
-    for start in range(0, len(x), piece):
-        stop = min(start + piece, len(x))
-        windows = np.lib.stride_tricks.sliding_window_view(
-            padded[start : stop + 2 * half], 2 * half + 1, 0
-        )
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, 0)
+    frames, columns = np.nonzero(asked)
+    out = np.full(len(frames), np.nan)
+    # Many go in pieces, so that the windows of one piece fit into little memory.
+    piece = max(1, _PIECE // (2 * half + 1))
+    for start in range(0, len(out), piece):
+        here = slice(start, start + piece)
         # NaN is sorted to the end, so the known values of a window are its first `count`.
-        ordered = np.sort(windows, axis=-1)
-        count = (~np.isnan(windows)).sum(-1, keepdims=True)
+        ordered = np.sort(windows[frames[here], columns[here]], axis=-1)
+        count = (~np.isnan(ordered)).sum(-1, keepdims=True)
         low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, -1)
         high = np.take_along_axis(ordered, np.minimum(count // 2, 2 * half), -1)
-        out[start:stop] = ((low + high) / 2)[..., 0]
+        out[here] = ((low + high) / 2)[..., 0]
     return out
 
 

@@ -102,12 +102,13 @@ def fit_heights(
     cyclic: bool = False,
     sink_m: float = SINK_M,
     known: bool = False,
+    measured: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> GroundFit:
     """How a motion with body poses `pos (T, B, 3)` m and `quat (T, B, 4)` would be set on the floor.
 
-    See `fit_ground`, which does it.
+    See `fit_ground`, which does it. measured: `low_and_com` of the poses, where that is known.
     """
-    low, com = low_and_com(table, pos, quat)
+    low, com = low_and_com(table, pos, quat) if measured is None else measured
     flights = find_flights(low, com, fps)
     stance = stance_heights(table, pos, quat, fps)
     lift = -float(np.quantile(low, 0.1))

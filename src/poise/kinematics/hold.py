@@ -31,8 +31,8 @@ from poise.motion.rotations import (
     quat_distance,
     quat_mul,
 )
-from poise.motion.smoothing import gaussian, smooth_lift
-from poise.motion.vectors import cross
+from poise.motion.smoothing import gaussian, smooth_lift, solve_banded
+from poise.motion.vectors import cross, sliding
 
 #: A (s) and B (1/s) of `lead`.
 SMOOTH_S, RETURN_PER_S = 0.006, 0.6
@@ -164,9 +164,7 @@ def _solve(rows: list[Rows], width: int, fixed: np.ndarray, fps: float) -> np.nd
             _add(band, rhs, bend, np.zeros(frames - 2), np.full(frames - 2, SMOOTH_S**2))
         back = np.where(fixed, _PINNED, RETURN_PER_S**2)
         _add(band, rhs, np.tile(unit, (frames, 1, 1)), np.zeros(frames), back)
-    from scipy.linalg import solveh_banded
-
-    x = solveh_banded(band, rhs, lower=True).reshape(frames, width)
+    x = solve_banded(band, rhs[:, None]).reshape(frames, width)
     x[fixed] = 0.0
     return x
 
@@ -330,10 +328,7 @@ def mend_path(clip: Clip, support: FloorPoints, faults: list[Fault]) -> Clip:
         near[max(fault.start - 1, 0) : fault.stop + 1] = 1.0
     # The correction fades out over the averaging time beside the spells that slide.
     reach = max(1, round(COMMON_S * clip.fps))
-    # Takes 0.2 s to load, which `poise info` need not wait for.
-    from scipy.ndimage import maximum_filter1d
-
-    hull = maximum_filter1d(near, 2 * reach + 1, mode="constant")
+    hull = sliding(np.pad(near, reach), 2 * reach + 1).max(-1)
     window = gaussian(0.3 * COMMON_S * clip.fps)
     hull = np.convolve(np.pad(hull, len(window) // 2, mode="edge"), window, "valid")
     path = np.array(clip.root_pos)

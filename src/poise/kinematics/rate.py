@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from poise.body import BodyTable, generate_table
+from poise.body import BodyTable, body_of
 from poise.errors import PoiseError
 from poise.formats import read_clip as read_as_stated
 from poise.formats.guess import root_jumps
@@ -20,6 +20,7 @@ from poise.kinematics.feet import NEAR_M, soles_of
 from poise.kinematics.forward import centre_of_mass, extreme_points, poses_of
 from poise.metrics.shape_points import PIECE
 from poise.motion import Clip
+from poise.motion.clip import remembered
 from poise.motion.rotations import GRAVITY
 from poise.motion.smoothing import find_runs, gaussian
 
@@ -439,14 +440,17 @@ def judge_rate(clip: Clip, table: BodyTable | None = None) -> RateJudgement:
 
     table: a body on the clip's skeleton; by default one is made.
     """
-    unjudged = RateJudgement(clip.fps)
     if clip.frames < LEAST_FRAMES:
-        return unjudged
+        return RateJudgement(clip.fps)
+    return _judged(clip) if table is None else judge_moved(Moved(_part(clip), table), clip.fps)
+
+
+@remembered
+def _judged(clip: Clip) -> RateJudgement:
     try:
-        table = table or generate_table(clip.skeleton, None, [clip])
+        return judge_rate(clip, body_of(clip))
     except PoiseError:
-        return unjudged
-    return judge_moved(Moved(_part(clip), table), clip.fps)
+        return RateJudgement(clip.fps)
 
 
 def judge_moved(moved: Moved, fps: float) -> RateJudgement:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from poise.body import BodyTable, generate_table
+from poise.body import BodyTable, body_of
 from poise.errors import PoiseError
 from poise.kinematics.feet import NEAR_M
 from poise.kinematics.forward import extreme_points
@@ -297,7 +297,7 @@ def find_travel(clip: Clip, table: BodyTable | None = None) -> Travel | None:
     """
     if table is None:
         try:
-            table = generate_table(clip.skeleton, None, [clip])
+            table = body_of(clip)
         except PoiseError:
             return None
     joints = [r.joint for r in table.rows]

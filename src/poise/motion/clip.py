@@ -3,22 +3,24 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownVariableType=false
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, wraps
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.rotations import slerp
 from poise.motion.skeleton import Skeleton
+from poise.motion.vectors import norm
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+T = TypeVar("T")
 MIN_FPS, MAX_FPS = 0.1, 2000.0
 """Frames per second that motion can have; others are damage, and ask for endless frames."""
 MAX_POSES = 20_000_000
@@ -106,7 +108,7 @@ class Clip:
             raise PoiseError(
                 f"the root position is not finite at frame {frame}", self.name, code="not-finite"
             )
-        norms = np.linalg.norm(self.rot, axis=-1)
+        norms = norm(self.rot)
         if not np.isfinite(norms).all() or np.abs(norms - 1).max() > 1e-4:
             bad = np.argwhere(~(np.abs(norms - 1) <= 1e-4))[0]
             raise PoiseError(
@@ -139,7 +141,7 @@ class Clip:
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """World joint positions `(T, J, 3)` m and rotations `(T, J, 4)` wxyz, not to be written on."""
-        return _kept_world(self) if self.rot.size <= _KEPT else _world(self)
+        return _world(self)
 
     def positions(self) -> np.ndarray:
         """World joint positions `(T, J, 3)` m."""
@@ -150,18 +152,25 @@ class Clip:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
-#: Numbers of a clip's rotations up to which its world is kept: a minute or two.
+#: Numbers of a clip's rotations up to which what is told of it is kept: a minute or two.
 _KEPT = 2**22
 
 
+def remembered(told: Callable[[Clip], T]) -> Callable[[Clip], T]:
+    """A function of a clip that keeps its last few answers: one motion is asked the same again and
+    again. Long clips are not kept, since each would stay in memory with what is told of it."""
+    few = lru_cache(maxsize=4)(told)
+
+    @wraps(told)
+    def ask(clip: Clip) -> T:
+        return few(clip) if clip.rot.size <= _KEPT else told(clip)
+
+    return ask
+
+
+@remembered
 def _world(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
-    return clip.skeleton.forward(clip.root_pos, clip.rot)
-
-
-@lru_cache(maxsize=4)
-def _kept_world(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
-    """One motion is asked for its world again and again: the last few are kept."""
-    pos, rot = _world(clip)
+    pos, rot = clip.skeleton.forward(clip.root_pos, clip.rot)
     pos.flags.writeable = rot.flags.writeable = False
     return pos, rot
 

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -132,7 +133,13 @@ def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> R
     Raises:
         PoiseError: a stated joint or role that does not exist.
     """
-    fixed = {skeleton.index(name): check_role(role) for name, role in (stated or {}).items()}
+    return _found_roles(skeleton, tuple((stated or {}).items()))
+
+
+@lru_cache(maxsize=8)
+def _found_roles(skeleton: Skeleton, stated: tuple[tuple[str, str], ...]) -> Roles:
+    """One skeleton is asked for its parts again and again: those of the last few are kept."""
+    fixed = {skeleton.index(name): check_role(role) for name, role in stated}
     taken: dict[str, str] = {}
     for joint, role in fixed.items():
         if role in taken:
@@ -245,14 +252,15 @@ class _Finder:
     def _limb(self, side: str, kinds: tuple[str, ...]) -> dict[str, int]:
         """The best reading of one limb: kinds in order along one line from the root to a leaf."""
         best: tuple[float, dict[str, int]] = (0.0, {})
+        scores = [[self._score(j, side, kind) for kind in kinds] for j in range(len(self.skeleton))]
         for line in self.lines:
-            score, reading = self._read(tuple(line), side, kinds)
+            score, reading = self._read(line, kinds, scores)
             if score > best[0] + 1e-9:
                 best = (score, reading)
         return best[1]
 
     def _read(
-        self, line: tuple[int, ...], side: str, kinds: tuple[str, ...]
+        self, line: list[int], kinds: tuple[str, ...], scores: list[list[float]]
     ) -> tuple[float, dict[str, int]]:
         # The best reading of the rest of the line, by the kind from which on it is read; leaf first.
         below: list[_Reading] = [(0.0, ())] * (len(kinds) + 1)
@@ -261,7 +269,7 @@ class _Finder:
             for k in reversed(range(len(kinds))):
                 # Nearer the root wins among equals: of wrist and hand the wrist is the joint.
                 options = [here[k + 1], below[k]]
-                own = self._score(joint, side, kinds[k])
+                own = scores[joint][k]
                 if own > 0:
                     more, rest = below[k + 1]
                     options.insert(0, (own + more, ((kinds[k], joint), *rest)))

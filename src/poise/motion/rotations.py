@@ -14,14 +14,24 @@ from typing import Any, cast, overload
 
 import numpy as np
 
-from poise.motion.vectors import Array, constant_like, cross, floored, limited, namespace, norm
+from poise.motion.vectors import (
+    LARGE,
+    Array,
+    constant_like,
+    cross,
+    floored,
+    limited,
+    namespace,
+    norm,
+    parts,
+)
 
 
 def _bilinear(a: Array, b: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
     """Sums of the 16 products a_i b_j with the columns of `rows (16, k)`: `(..., k)`.
 
     One outer product and one small matrix product take the place of some thirty passes over short
-    strided columns, which cost more than their arithmetic.
+    columns, see `LARGE`.
     """
     outer = a[..., :, None] * b[..., None, :]
     return outer.reshape(*outer.shape[:-2], 16) @ constant_like(rows, outer)
@@ -56,6 +66,13 @@ def normalize(q: Array) -> Array:
 
 def quat_mul(a: Array, b: Array) -> Array:
     """Hamilton product `(..., 4)`: the rotation `b` followed by `a`."""
+    if isinstance(a, np.ndarray) and (a.size >= LARGE or b.size >= LARGE):
+        (w, x, y, z), (s, i, j, k), out = parts(a, b)
+        out[..., 0] = w * s - x * i - y * j - z * k
+        out[..., 1] = w * i + x * s + y * k - z * j
+        out[..., 2] = w * j - x * k + y * s + z * i
+        out[..., 3] = w * k + x * j - y * i + z * s
+        return out
     return _bilinear(a, b, _PRODUCT)
 
 
@@ -69,12 +86,21 @@ def quat_conj(q: Array) -> Array:
 
 def quat_between(a: Array, b: Array) -> Array:
     """What turns `a` into `b`, in the frame of `a`: a^-1 b `(..., 4)` of unit quaternions."""
+    if isinstance(a, np.ndarray) and (a.size >= LARGE or b.size >= LARGE):
+        return quat_mul(quat_conj(a), b)
     return _bilinear(a, b, _BETWEEN)
 
 
 def quat_rotate(q: Array, v: Array) -> Array:
     """Vectors `v (..., 3)` of the local frame expressed in the parent frame."""
     # v' = v + 2 w (u x v) + 2 u x (u x v)
+    if isinstance(q, np.ndarray) and (q.size >= LARGE or v.size >= LARGE):
+        (w, x, y, z), (i, j, k), out = parts(q, v)
+        a, b, c = 2.0 * (y * k - z * j), 2.0 * (z * i - x * k), 2.0 * (x * j - y * i)
+        out[..., 0] = i + w * a + (y * c - z * b)
+        out[..., 1] = j + w * b + (z * a - x * c)
+        out[..., 2] = k + w * c + (x * b - y * a)
+        return out
     u = q[..., 1:]
     t = 2.0 * cross(u, v)
     return v + q[..., :1] * t + cross(u, t)
@@ -424,6 +450,9 @@ def forward_kinematics(
     if len(parents) > _MANY:
         return _by_doubling(parents, offsets, root_pos, rot)
     xp = namespace(rot)
+    if isinstance(rot, np.ndarray):
+        # Each component in one row of memory, for the products by components.
+        rot = np.moveaxis(np.ascontiguousarray(np.moveaxis(rot, (-2, -1), (0, 1))), (0, 1), (-2, -1))
     pos: list[Any] = []
     quat: list[Any] = []
     for j, parent in enumerate(parents):

@@ -63,9 +63,8 @@ class Spectrum:
         y = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
         window = np.hanning(frames + 2)[1:-1]
         size = 2 ** math.ceil(math.log2(4 * frames))
-        raw = np.abs(np.fft.rfft(y * window[:, None], size, axis=0)) ** 2 / (window**2).sum()
-        power = np.zeros((len(raw), int(groups.max()) + 1))
-        np.add.at(power.T, groups, raw.T)
+        raw = squared(np.fft.rfft(y * window[:, None], size, axis=0)) / (window**2).sum()
+        power = raw @ (groups[:, None] == np.arange(groups.max() + 1)).astype(float)
         return cls(np.fft.rfftfreq(size, 1 / fps), raw, power, 2.0 * fps / frames, fps)
 
     def near(self, hz: float) -> np.ndarray:
@@ -159,6 +158,11 @@ class Spectrum:
         return np.asarray(variance) * (2.0 / self.width) * self.fps / 3.0
 
 
+def squared(waves: np.ndarray) -> np.ndarray:
+    """|z|^2 of complex numbers z."""
+    return np.real(waves) ** 2 + np.imag(waves) ** 2
+
+
 def _largest(values: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
     """`(N, C)` the largest of `values (B, C)` from `first (N)` up to but without `stop (N)`."""
     table, reach = [values], 1
@@ -219,19 +223,70 @@ FILL_HZ = 6.0
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
-def filled(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
-    """`y (T, C)` with the frames that are not `known (T)` on the smoothest curve through the rest."""
-    band = np.zeros((4, len(y)))
-    band[0] = known + 1e-9
-    from scipy.linalg import solveh_banded
+#: Frames times tracks that are filled at once; more would take gigabytes.
+_AT_ONCE = 2**18
 
-    _add(band, _THIRD, float((2 * np.sin(np.pi * FILL_HZ / fps)) ** -6), len(y), 1, 0)
-    curve = solveh_banded(band, y * known[:, None], lower=True)
+
+def filled(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
+    """`y (T, C)` with the frames that are not `known (T)` on the smoothest curve through the rest; or
+    several of them, `(K, T, C)` and `(K, T)`."""
+    if y.ndim == 2:
+        return filled(y[None], known[None], fps)[0]
+    if known.all():
+        return y
+    tracks, frames = known.shape
+    if tracks > (most := max(1, _AT_ONCE // frames)):
+        each = [slice(k, k + most) for k in range(0, tracks, most)]
+        return np.concatenate([filled(y[k], known[k], fps) for k in each])
+    band = np.zeros((tracks, 4, frames))
+    band[:, 0] = known + 1e-9
+    _add(band, _THIRD, float((2 * np.sin(np.pi * FILL_HZ / fps)) ** -6), frames, 1, 0)
+    curve = solve_banded(band, y * known[..., None])
     # The curve passes by what it is told; what it leaves there goes on in between.
-    at, frames = np.flatnonzero(known), np.arange(len(y))
-    for c in range(y.shape[1]) if len(at) else ():
-        curve[:, c] += np.interp(frames, at, y[at, c] - curve[at, c])
-    return np.where(known[:, None], y, curve)
+    for k, seen in enumerate(known):
+        at = np.flatnonzero(seen)
+        for c in range(y.shape[-1]) if len(at) else ():
+            curve[k, :, c] += np.interp(np.arange(frames), at, y[k, at, c] - curve[k, at, c])
+    return np.where(known[..., None], y, curve)
+
+
+#: Rows of the blocks in which a banded matrix is solved.
+_BLOCK = 16
+
+
+def solve_banded(band: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """x `(..., T, C)` with A x = y, for A symmetric, positive definite and in lower banded form
+    `(..., W, T)`: row k of the band holds A[t + k, t].
+
+    As a matrix of blocks A has three diagonals, and is eliminated from its first block to its last.
+    SciPy has the same for one matrix, and takes longer to load than a clip takes to be read.
+    """
+    lead, (wide, frames), size = band.shape[:-2], band.shape[-2:], max(_BLOCK, band.shape[-2])
+    count = -(-frames // size)
+    rows, right = np.zeros((*lead, wide, count * size)), np.zeros((*lead, count * size, y.shape[-1]))
+    rows[..., :frames], right[..., :frames, :] = band, y
+    # The last block is filled up with equations x = 0.
+    rows[..., 0, frames:] = 1.0
+    rows, right = rows.reshape(*lead, wide, count, size), right.reshape(*lead, count, size, -1)
+    here, below = np.zeros((2, *lead, count, size, size))
+    for k in range(wide):
+        j = np.arange(size - k)
+        here[..., j + k, j] = here[..., j, j + k] = rows[..., k, :, : size - k]
+        j = np.arange(size - k, size)
+        below[..., j + k - size, j] = rows[..., k, :, size - k :]
+    known = right[..., 0, :, :]
+    ahead, out = [], []
+    for k in range(count):
+        above = np.swapaxes(below[..., k, :, :], -1, -2)
+        solved = np.linalg.solve(here[..., k, :, :], np.concatenate((above, known), -1))
+        ahead.append(solved[..., :size])
+        out.append(solved[..., size:])
+        if k + 1 < count:
+            here[..., k + 1, :, :] -= below[..., k, :, :] @ ahead[k]
+            known = right[..., k + 1, :, :] - below[..., k, :, :] @ out[k]
+    for k in reversed(range(count - 1)):
+        out[k] -= ahead[k] @ out[k + 1]
+    return np.concatenate(out, -2)[..., :frames, :]
 
 
 def pieces(frames: int, fps: float) -> list[slice]:
@@ -316,7 +371,7 @@ def _add(band: np.ndarray, row: np.ndarray, weight: float, frames: int, stride: 
     for i in range(len(row)):
         for j in range(i + 1):
             at = stride * (np.arange(max(count, 0)) + j) + first
-            band[stride * (i - j), at] += weight * row[i] * row[j]
+            band[..., stride * (i - j), at] += weight * row[i] * row[j]
 
 
 @lru_cache(maxsize=64)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from poise.body import Anatomy, find_anatomy, generate_table
+from poise.body import Anatomy, body_of, find_anatomy
 from poise.errors import PoiseError
 from poise.formats.point_noise import drop_spikes
 from poise.kinematics.rate import judge_rate
@@ -19,6 +19,7 @@ from poise.kinematics.repair.speeds import TRUNK_SPEED, SpeedRepair, limit_speed
 from poise.kinematics.repair.turns import Flip, out_of_reach, unflip
 from poise.kinematics.travel import Travel, find_travel
 from poise.motion import Clip, Skeleton
+from poise.motion.clip import remembered
 from poise.motion.rotations import (
     forward_kinematics,
     normalize,
@@ -42,9 +43,11 @@ from poise.motion.smoothing import (
     only_noise,
     pieces,
     smoothed,
+    squared,
     tremble_of,
     white_mm,
 )
+from poise.motion.vectors import norm
 
 #: A joint that stands still for so long (s) and leaps on by so many of its steps, by this angle (rad) at
 #: least, was held.
@@ -85,9 +88,15 @@ def _filled(rot: np.ndarray, found: Sequence[Lost], fps: float) -> np.ndarray:
     rot, lost = rot.copy(), np.zeros(rot.shape[:2], dtype=bool)
     for _, j, a, b in found:
         lost[a : b + 1, j] = True
-    for j in np.flatnonzero(lost.any(0)):
-        rot[:, j] = filled(rot[:, j], ~lost[:, j], fps)
+    if len(at := np.flatnonzero(lost.any(0))):
+        rot[:, at] = _refilled(rot, lost, at, fps)
     return rot / np.linalg.norm(rot, axis=-1, keepdims=True)
+
+
+def _refilled(rot: np.ndarray, lost: np.ndarray, joints: np.ndarray, fps: float) -> np.ndarray:
+    """`(T, N, 4)` the rotations of N joints, `filled` where they were `lost (T, J)`."""
+    tracks = filled(rot[:, joints].swapaxes(0, 1), ~lost[:, joints].T, fps)
+    return tracks.swapaxes(0, 1)
 
 
 def denoise(clip: Clip) -> Clip:
@@ -125,14 +134,15 @@ def _turn(rot: np.ndarray) -> float:
     return float(np.median(step[step > STILL_RAD])) if (step > STILL_RAD).any() else 0.0
 
 
-def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
+@remembered
+def noise_faults(clip: Clip) -> tuple[tuple[Fault, ...], Clip]:
     """The faults that noise is, and the clip with its lost joints filled in.
 
     A tremble of the body counts in mm (rms over joints), the largest of any piece; spikes and held
     joints count in degrees.
     """
     if clip.frames < SHORTEST:
-        return [], clip
+        return (), clip
     rot = _continuous(clip.rot)
     for here in pieces(clip.frames, clip.fps):
         if (turn := _turn(rot[here])) > NOTHING_RAD:
@@ -155,7 +165,7 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     if trembles:
         worst = max(trembles, key=lambda f: f.size)
         out.append(replace(worst, start=trembles[0].start, stop=trembles[-1].stop))
-    return out, whole
+    return tuple(out), whole
 
 
 def _trembles(clip: Clip) -> list[Fault]:
@@ -229,9 +239,10 @@ def find_lost(clip: Clip, rot: np.ndarray, noisy: bool = False) -> list[Lost]:
     """
     spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
     sure = np.zeros_like(spikes)
-    for j in np.flatnonzero(spikes.any(0)):
-        back = filled(rot[:, j], ~spikes[:, j], clip.fps)
-        turned = 2.0 * np.linalg.norm(back - rot[:, j], axis=-1)
+    joints = np.flatnonzero(spikes.any(0))
+    back = _refilled(rot, spikes, joints, clip.fps)
+    for k, j in enumerate(joints):
+        turned = 2.0 * np.linalg.norm(back[:, k] - rot[:, j], axis=-1)
         least = max(SPIKE_RAD, SPIKE_M / max(lever[j], 1e-3))
         for a, b in find_runs(spikes[:, j], 0):
             sure[a : b + 1, j] = turned[a : b + 1].max() >= least
@@ -297,17 +308,22 @@ def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
 
 def _rough(places: np.ndarray, n: int) -> np.ndarray:
     """`(T - n, J)` m, differences of an order of joints' places `(T, J, 3)`."""
-    return np.linalg.norm(np.diff(places, n=n, axis=0), axis=-1)
+    return norm(np.diff(places, n=n, axis=0))
 
 
 def _continuous(rot: np.ndarray) -> np.ndarray:
     """Rotations `(T, J, 4)` continuous in sign; a frame that leaps by a half turn does not exchange the
     sign of those after it, as it may in `unwrap_quats`."""
-    out, before = np.array(rot), np.array(rot[:1])
-    for t in range(1, len(out)):
-        away = (before * out[t]).sum((0, -1)) < 0
-        out[t, away] *= -1.0
-        before = out[max(0, t - 2) : t + 1]
+    out, alike = np.array(rot), np.zeros(rot.shape[:2])
+    for k in (1, 2, 3):
+        alike[k:] += (rot[k:] * rot[:-k]).sum(-1)
+    # Most joints never leave the hemisphere of the three frames before.
+    leaves = np.flatnonzero((alike < 0).any(0))
+    loose = out[:, leaves]
+    for t in range(1, len(out) if len(leaves) else 0):
+        away = (loose[max(0, t - 3) : t] * loose[t]).sum((0, -1)) < 0
+        loose[t, away] *= -1.0
+    out[:, leaves] = loose
     return out
 
 
@@ -321,7 +337,7 @@ def _small_spikes(rot: np.ndarray, known: np.ndarray, fps: float, least: float) 
 
     found, reach = known.copy(), 2 * max(2, round(0.5 * fps)) + 1
     for _ in range(SPIKE_ROUNDS):
-        calm = np.stack([filled(rot[:, j], ~found[:, j], fps) for j in range(rot.shape[1])], 1)
+        calm = _refilled(rot, found, np.arange(rot.shape[1]), fps)
         rough = np.zeros_like(calm)
         rough[2:-2] = np.diff(calm, n=4, axis=0) / 6.0
         size = np.linalg.norm(rough, axis=-1)
@@ -391,7 +407,7 @@ def _repeats(y: np.ndarray) -> bool:
     """Whether `y (T, C)` is one cycle again and again."""
     frames, y = len(y), y - y.mean(0)
     # |y_t - y_t+P|^2 summed over t, of all P at once.
-    power = (np.abs(np.fft.rfft(y, 2 * frames, axis=0)) ** 2).sum(1)
+    power = squared(np.fft.rfft(y, 2 * frames, axis=0)).sum(1)
     shared = np.fft.irfft(power)[: frames // 2 + 1]
     square = np.concatenate(([0.0], np.cumsum((y**2).sum(1))))
     lag = np.arange(3, frames // 2 + 1)
@@ -533,7 +549,7 @@ def clean_clip(
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
     raw = clip.skeleton.source.raw if raw is None else raw
-    found, whole = ([], clip) if raw else noise_faults(clip)
+    found, whole = ((), clip) if raw else noise_faults(clip)
     turned, flips = unflip(whole, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     kept: tuple[SpeedRepair, ...] = ()
@@ -541,7 +557,7 @@ def clean_clip(
         slowed, speeds, kept = without_rougher(turned, slowed, speeds)
     if any(f.kind == "tremble" for f in found):
         slowed = denoise(slowed)
-    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, tuple(found))
+    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, found)
 
 
 @dataclass(frozen=True)
@@ -559,8 +575,7 @@ def find_faults(clip: Clip) -> Faults | None:
     """The faults of a clip, before a body is fitted; None where its joints are no human's."""
     try:
         _, report = clean_clip(clip)
-        table = generate_table(clip.skeleton, None, [clip])
-        judged = judge_rate(clip, table)
+        table, judged = body_of(clip), judge_rate(clip)
     except PoiseError:
         return None
     doubt = judged.sentence()

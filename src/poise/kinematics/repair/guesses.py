@@ -76,7 +76,7 @@ def grounded(clip: Clip, support: FloorPoints | None, stated: float | None) -> C
 
 
 def _rate(clip: Clip, support: FloorPoints | None, why: str) -> GuessedValue:
-    judged = RateJudgement(clip.fps) if support is None else judge_rate(clip, support.table)
+    judged = RateJudgement(clip.fps) if support is None else judge_rate(clip)
     if judged.likely is not None:
         why += f"; but {judged.why()}: likely it has {judged.likely:g} frames per second"
     elif judged.fall is not None:

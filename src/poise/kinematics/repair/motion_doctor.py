@@ -156,7 +156,7 @@ def without_noise(clip: Clip) -> tuple[Clip, CleanReport]:
     healed = heal(clip, found=Examination((), {}, False, cleaned=(clip, cleaned, report)))
     if healed.frames != clip.frames:
         calm = denoise(whole) if any(f.kind == "tremble" for f in found) else whole
-        return calm, CleanReport(noise=tuple(found))
+        return calm, CleanReport(noise=found)
     return healed, replace(report, left=(), kept=())
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
+from poise.body import Anatomy, BodyTable, body_of, find_anatomy
 from poise.errors import PoiseError
 from poise.kinematics.feet import NEAR_M, soles_of
 from poise.kinematics.forward import carried, low_and_com
@@ -68,6 +68,7 @@ class FloorPoints:
         low, margin, names = _low_points(clip, anatomy, *world)
         feet = [table.rows[row].joint for row in soles]
         said = dict(clip.contacts)
+        measured = low_and_com(table, pos, quat)
         labels = np.concatenate([said[j] for j in feet], 1) if feet and set(feet) <= set(said) else None
         return cls(
             clip.fps,
@@ -76,8 +77,8 @@ class FloorPoints:
             low,
             margin,
             names,
-            *low_and_com(table, pos, quat),
-            fit_heights(table, pos, quat, clip.fps),
+            *measured,
+            fit_heights(table, pos, quat, clip.fps, measured=measured),
             table,
             told_by(table, pos, quat, clip.fps),
             labels,
@@ -139,7 +140,7 @@ def anatomy_of(clip: Clip) -> Anatomy:
 def support_of(clip: Clip, anatomy: Anatomy) -> FloorPoints | None:
     """The support of a clip, None where no body can be made for its skeleton."""
     try:
-        table = generate_table(clip.skeleton, None, [clip])
+        table = body_of(clip)
     except PoiseError:
         return None
     return FloorPoints.of(clip, anatomy, table) if anatomy.parts else None
