@@ -16,11 +16,11 @@ import torch
 import poise
 from poise.body import Humanoid
 from poise.env import Frame, RewardTerm
-from poise.errors import PoiseError
 from poise.jobs.runs import begin, train
 from poise.learn import PPOConfig, Until, load_checkpoint
 from poise.motion import ClipLibrary
 from poise.recipes.residual_force_settings import ResidualForce
+from refusals import refused
 from toy_human import swing
 
 SCRIPT = """
@@ -108,5 +108,5 @@ def test_rewards_of_a_program_leave_a_run_that_opens(tmp_path: Path) -> None:
     assert 0 < heard[0] < 1
     assert made.run is not None
     assert poise.open_run(tmp_path).score().succ == made.card.succ
-    with pytest.raises(PoiseError, match="low_hands"):
+    with refused("settings-differ", "low_hands"):
         poise.imitate(clip, **how, **small)
