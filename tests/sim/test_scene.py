@@ -199,7 +199,7 @@ def test_a_ball_that_is_thrown_and_its_impulse() -> None:
 
 
 def test_a_soft_box_hits_less_hard_than_a_hard_one() -> None:
-    """The same box falls as far onto the floor: the force is smaller, the time longer, the impulse alike."""
+    """The same box falls onto the floor: a smaller force for longer, and the same impulse."""
     peaks, impulses = [], []
     for soft in (0.0, 0.1):
         box = Box("bag", (0.3, 0.3, 0.3), (0, 0, 0.35), mass=40.0, soft_s=soft)

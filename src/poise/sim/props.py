@@ -57,8 +57,8 @@ class Box(Checked):
         pos: m, its centre at first.
         quat: wxyz, box to world at first.
         mass: kg; 0 fixes it to the world.
-        soft_s: s, time constant of its contacts (MuJoCo's `solref`, with an impedance of a half), as of a
-            cushion or a punching bag; 0 leaves it as hard as everything else.
+        soft_s: s, time constant of its contacts (MuJoCo's `solref`, at an impedance of a half), as of
+            a cushion or a punching bag; 0 leaves it as hard as everything else.
     """
 
     name: str = "box"
@@ -75,7 +75,8 @@ class Box(Checked):
             body.add_freejoint(name=self.name)
         geom = solid(body, self.name, "box", [s / 2 for s in self.size], mass=self.mass)
         if self.soft_s:
-            # Its own softness counts, not a mean with that of what touches it. The half is `scene.FLESH`'s.
+            # Its own softness counts, not a mean with that of what touches it; the half is that of
+            # `scene.FLESH`.
             geom.solref, geom.priority = [self.soft_s, 1.0], 1
             geom.solimp[:2] = [0.5, 0.5]
 
