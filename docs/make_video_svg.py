@@ -1,4 +1,4 @@
-"""Draws docs/sam3d.svg, docs/gvhmr.svg and docs/hy_motion.svg: motion as those projects write it, and mended.
+"""Draws docs/sam3d.svg, gvhmr.svg and hy_motion.svg: motion as those projects write it, and mended.
 
     python docs/make_video_svg.py docs
 
@@ -27,7 +27,7 @@ from poise.motion.rotations import quat_to_rotvec
 
 WALK = Path(__file__).parents[1] / "src" / "poise" / "data" / "walk.bvh"
 SIZE, SCALE = (860, 320), 104.0
-#: Height of the floor in the picture, and of the middle of what is seen from above, sideways twice as wide.
+#: Height of the floor, and of the middle of what is seen from above, sideways twice as wide.
 FLOOR, ABOVE, WIDE = 222.0, 272.0, 2.0
 MOMENTS = 5
 COLOURS = {"before": "#3b6fb6", "after": "#dd7722", "stands": "#1f8a4c"}
@@ -93,7 +93,8 @@ def write_sam3d(clip: Clip, folder: Path) -> Path:
     for s, side in enumerate(("left", "right")):
         toe, ankle = (pos[:, names.index(f"{side}_{part}")] for part in ("foot", "ankle"))
         points[:, 15 + 3 * s] = points[:, 16 + 3 * s] = toe
-        points[:, 17 + 3 * s] = ankle + [0.0, 0.05, 0.0] - 0.3 * (toe - ankle) * [1.0, 0.0, 1.0]
+        back = np.array([-0.3, 0.0, -0.3]) * (toe - ankle)
+        points[:, 17 + 3 * s] = ankle + back + np.array([0.0, 0.05, 0.0])
         points[:, (62, 41)[s]] = pos[:, names.index(f"{side}_wrist")]
     points[:, 69] = pos[:, names.index("neck")]
     root = pos[:, 0]
@@ -122,12 +123,13 @@ def picture(clips: dict[str, Clip]) -> str:
         along = pos @ right * SCALE + (k + 0.5) * SIZE[0] / 2
         flat = np.stack([along, FLOOR - pos[..., 2] * SCALE], -1)
         above = np.stack([along, ABOVE - pos @ away * WIDE * SCALE], -1)
-        ends = k * SIZE[0] / 2 + 16, (k + 1) * SIZE[0] / 2 - 16
-        parts.append(f'<path stroke="#999" d="M{ends[0]:.0f} {FLOOR:.0f}H{ends[1]:.0f}"/>')
+        first, last = k * SIZE[0] / 2 + 16, (k + 1) * SIZE[0] / 2 - 16
+        parts.append(f'<path stroke="#999" d="M{first:.0f} {FLOOR:.0f}H{last:.0f}"/>')
         parts.append(f'<text x="{20 + k * SIZE[0] / 2:.0f}" y="28" fill="{COLOURS[name]}">{name}</text>')
         for t in np.linspace(0, clip.frames - 1, MOMENTS).astype(int):
             bones = [(p, j) for j, p in enumerate(clip.skeleton.parents) if p >= 0]
-            line = "".join("M{:.0f} {:.0f}L{:.0f} {:.0f}".format(*flat[t, p], *flat[t, j]) for p, j in bones)
+            ends = ((*flat[t, p], *flat[t, j]) for p, j in bones)
+            line = "".join("M{:.0f} {:.0f}L{:.0f} {:.0f}".format(*four) for four in ends)
             parts.append(f'<path stroke="{COLOURS[name]}" stroke-width="6" opacity="0.55" d="{line}"/>')
         parts += steps(clip, above, COLOURS[name])
     inside = "\n".join(parts)
