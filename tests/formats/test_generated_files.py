@@ -1,13 +1,15 @@
-"""What generators and pose estimators write: arrays of joints, Kimodo, HY-Motion, GVHMR."""
+"""What generators and pose estimators write: joints, Kimodo, HY-Motion, GVHMR, SAM 3D Body."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from handmade_numpy_files import amass
+from handmade_numpy_files import amass, save_npz, save_pickle
 
 from poise.formats import read_clip, write_clip
 from poise.formats.named_arrays import SKELETONS
@@ -15,9 +17,11 @@ from poise.formats.smpl import LAYOUTS
 from poise.motion import Clip
 from poise.motion.rotations import forward_kinematics, quat_to_matrix, rotvec_to_quat
 from refusals import refused
+from test_docs import WALK
 from toy_human import swing
 
 FRAMES = 24
+POINTED = ("pred_keypoints_3d", "pred_cam_t")
 
 
 def moved(names, parents, offsets, seed: int = 0):
@@ -117,3 +121,71 @@ def test_gvhmrs_result_is_read_as_its_npz_is(tmp_path: Path) -> None:
 def test_a_clip_of_the_house_is_not_taken_for_kimodos(tmp_path: Path) -> None:
     write_clip(swing(), tmp_path / "s.npz")
     assert read_clip(tmp_path / "s.npz").skeleton.source.format != "kimodo"
+
+
+def _sam3d(clip: Clip) -> list[list[dict[str, Any]]]:
+    """Results of SAM 3D Body as `process_one_image` gives them for each picture, made from a clip: the
+    person second in some pictures, somebody else beside."""
+    names = [n.lower() for n in clip.skeleton.names]
+    parts = {"shoulder": "arm", "elbow": "forearm", "hip": "upleg", "knee": "leg", "ankle": "foot"}
+    pos = clip.positions()
+    # A camera's axes: X to the right, Y down, Z ahead.
+    pos = np.stack([pos[..., 0], -pos[..., 2], pos[..., 1] + 4.0], -1)
+    points = np.full((clip.frames, 70, 3), np.nan)
+    for k, part in enumerate(parts.values()):
+        for s, side in enumerate(("left", "right")):
+            points[:, 5 + 2 * k + s] = pos[:, names.index(side + part)]
+    for column, name in ((62, "lefthand"), (41, "righthand"), (69, "neck"), (0, "head")):
+        points[:, column] = pos[:, names.index(name)]
+    for column, name in ((15, "lefttoe"), (18, "righttoe")):
+        points[:, column] = points[:, column + 1] = pos[:, names.index(name)]
+        points[:, column + 2] = points[:, 13 if column == 15 else 14] + np.array([0.0, 0.06, 0.0])
+    points = np.where(np.isnan(points), points[:, :1], points)
+    root = points[:, 9:11].mean(1)
+
+    def one(t: int, aside: float) -> dict[str, Any]:
+        place = root[t] + [aside, 0.0, 0.0]
+        return {"pred_keypoints_3d": points[t] - root[t], "pred_cam_t": place, "bbox": np.zeros(4)}
+
+    mine, other = (lambda t: one(t, 0.0)), (lambda t: one(t, 3.0))
+    return [[mine(t), other(t)] if t % 3 or not t else [other(t), mine(t)] for t in range(clip.frames)]
+
+
+@pytest.mark.parametrize("form", ["pickle", "torch", "json", "npz", "frames"])
+def test_sam_3d_body_is_read_in_each_form_that_people_save(tmp_path: Path, form: str) -> None:
+    walk = read_clip(WALK)
+    frames = _sam3d(walk)
+    whole = {k: np.stack([min(f, key=lambda p: p["pred_cam_t"][0])[k] for f in frames]) for k in POINTED}
+    plain = [[{k: np.asarray(v).tolist() for k, v in p.items()} for p in f] for f in frames]
+    if form == "pickle":
+        path = save_pickle(tmp_path / "a.pkl", {f"{t:06d}.jpg": f for t, f in enumerate(frames)})
+    elif form == "torch":
+        path = tmp_path / "a.pt"
+        torch.save([[{k: torch.tensor(v) for k, v in p.items()} for p in f] for f in frames], path)
+    elif form == "npz":
+        path = save_npz(tmp_path / "a.npz", whole)
+    else:
+        path = tmp_path / "a.json"
+        named = [{"frame": f"{t}.jpg", "outputs": f} for t, f in enumerate(plain)]
+        path.write_text(json.dumps(plain if form == "json" else named))
+    with refused("rate-missing", says=("--fps",)):
+        read_clip(path, allow_pickle=True)
+    clip = read_clip(path, fps=30, allow_pickle=True)
+    source = clip.skeleton.source
+    assert (source.format, source.up_axis, clip.frames) == ("sam3d", "-Y", walk.frames)
+    assert any("camera's frame" in note for note in source.notes)
+    # The same walk, wherever the camera stood.
+    for name in ("LeftFoot", "RightHand"):
+        there, here = (c.positions()[:, c.skeleton.names.index(name)] for c in (clip, walk))
+        steps = [np.diff(p, axis=0) for p in (there, here)]
+        np.testing.assert_allclose(steps[0][:, 2], steps[1][:, 2], atol=0.02)
+        np.testing.assert_allclose(*(np.linalg.norm(s, axis=-1) for s in steps), atol=0.03)
+
+
+def test_turns_of_the_rig_without_places_are_refused(tmp_path: Path) -> None:
+    path = save_npz(tmp_path / "a.npz", {"mhr_model_params": np.zeros((4, 204)), "fps": 30})
+    with refused("key-missing", says=("pred_keypoints_3d",)):
+        read_clip(path)
+    frames = {"pred_keypoints_3d": np.zeros((4, 17, 3)), "fps": 30}
+    with refused("wrong-shape", "70"):
+        read_clip(save_npz(tmp_path / "b.npz", frames))

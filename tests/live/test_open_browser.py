@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from chromium import CHROMIUM, Page, opened
 
 from poise.cli.open import HEAVY, PRELOAD, look, rests, work
@@ -163,6 +164,8 @@ def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: P
     assert "--keyframes 0,40,85" in page.until(f"{said}.includes('85') && {said}", 20)
     do(page, "between")
     page.until("document.body.dataset.busy === 'yes'")
+    # A picture takes few calls, whatever the number of bones.
+    assert 0 < page.js("poiseOpen.state.calls") < 20
     # The stage shows what is simulated so far, and time goes along.
     page.until("poiseOpen.state.made && poiseOpen.state.made[1] > 4", 200)
     page.until("poiseOpen.state.frame > 2 && poiseOpen.state.frame < 85", 20)
@@ -178,6 +181,20 @@ def test_keys_between_and_the_stage_while_a_job_runs(server: OpenServer, page: P
     assert not [t for t in server.project.takes.values() if t.action == "between"]
     page.until("poiseOpen.state.made === null")
     press(page, "k")
+
+
+def test_a_file_that_needs_a_word_asks_for_it(page: Page, tmp_path: Path) -> None:
+    """GVHMR's result is pickled and states no rate: a press for each, and it is there to be saved."""
+    flat = {"global_orient": torch.zeros(40, 3), "body_pose": torch.zeros(40, 63)}
+    told = {**flat, "transl": torch.zeros(40, 3), "betas": torch.zeros(40, 10)}
+    torch.save({"smpl_params_global": told, "smpl_params_incam": told}, tmp_path / "hmr4d_results.pt")
+    drop(page, tmp_path / "hmr4d_results.pt")
+    for said in ("no code in it runs", "frames per second"):
+        page.until(f"document.getElementById('problem').innerText.includes('{said}')", 60)
+        page.js("document.querySelector('#problem button.main').click()")
+    shown(page, "hmr4d_results")
+    assert page.js("document.getElementById('problem').hidden && poiseOpen.state.motion.fps") == 30
+    assert page.js("document.getElementById('format').value") == ".bvh"
 
 
 #: Of what has the focus: its part of the page, a word on it, its edges, and whether a ring shows it.

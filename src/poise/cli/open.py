@@ -182,6 +182,7 @@ def _answered(made: Any) -> None:
         answer: dict[str, Any] = {"ok": True, **made()}
     except (KeyboardInterrupt, Exception) as problem:
         error = failure(problem)[1]
-        answer = {"ok": False, "error": {"what": error.what, "where": error.where, "hint": error.hint}}
+        told = {"what": error.what, "where": error.where, "hint": error.hint, "code": error.code}
+        answer = {"ok": False, "error": told}
     sys.stdout.write(json_.dumps(answer, default=str))
     sys.stdout.flush()

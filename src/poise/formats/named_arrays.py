@@ -42,6 +42,7 @@ from poise.formats.point_arrays import (
 from poise.formats.point_raw import as_clip
 from poise.formats.raw import RawMotion, ReadOptions, assemble, labelled, with_labels
 from poise.formats.refused import is_qpos, refuse_array, refuse_qpos
+from poise.formats.sam3d import is_sam3d, sam3d_points, stacked
 from poise.formats.smpl import LAYOUTS, is_amass_clip, is_smpl, read_smpl, write_amass
 from poise.formats.text import MAX_JOINTS, listed, shown
 from poise.motion.clip import Clip
@@ -282,6 +283,7 @@ KINDS: tuple[ArrayKind, ...] = (
     ArrayKind("Kimodo (posed_joints)", is_kimodo, read_kimodo),
     ArrayKind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
     ArrayKind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
+    ArrayKind("SAM 3D Body (pred_keypoints_3d)", is_sam3d, as_clip(sam3d_points)),
     ArrayKind("MDM (motion, lengths)", is_mdm, as_clip(mdm_points)),
     ArrayKind("joints, fps", is_named_joints, as_clip(named_joint_points)),
     ArrayKind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
@@ -322,7 +324,10 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
                 refuse_array(header.shape, path)
     if not options.allow_pickle:
         raise PoiseError("this is a pickled file", path, ASK, code="pickle-refused")
-    value, note = one_of_dicts(load_plain(path), _is_known, options.take, path)
+    value, note = load_plain(path), list[str]()
+    if (frames := stacked(value, options.take, path)) is not None:
+        return _read(frames, path, options)
+    value, note = one_of_dicts(value, _is_known, options.take, path)
     clip = _read(named_arrays(value, path), path, replace(options, take=None) if note else options)
     source = clip.skeleton.source
     return clip.replaced(skeleton=clip.skeleton.with_source(notes=(*note, *source.notes)))
@@ -340,7 +345,9 @@ def read_torch(path: Path, options: ReadOptions) -> Clip:
     if not options.allow_pickle:
         raise PoiseError("this is a pickled file of torch", path, ASK, code="pickle-refused")
     value, note = load_torch(path), ()
-    if is_gvhmr(value):
+    if (frames := stacked(value, options.take, path)) is not None:
+        value = frames
+    elif is_gvhmr(value):
         # GVHMR's world has gravity along -Y.
         value = {"up_axis": "Y", **value["smpl_params_global"]}
         note = ("GVHMR's motion in the world, Y up; that in the camera's frame was left",)

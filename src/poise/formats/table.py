@@ -106,18 +106,24 @@ READERS = (
         _late("poise.formats.named_arrays:read_npz"),
     ),
     Reader(
-        "pickled SMPL, poselib or MDM",
+        "pickled SMPL, poselib, MDM or SAM 3D Body",
         (".pkl", ".npy"),
         _late("poise.formats.named_arrays:looks_like_pickle"),
         _late("poise.formats.named_arrays:read_pickled"),
         asks=(".pkl",),
     ),
     Reader(
-        "GVHMR",
+        "GVHMR and SAM 3D Body",
         (".pt", ".pth"),
         _late("poise.formats.named_arrays:looks_like_torch"),
         _late("poise.formats.named_arrays:read_torch"),
         asks=(".pt", ".pth"),
+    ),
+    Reader(
+        "SAM 3D Body",
+        (".json",),
+        _late("poise.formats.sam3d:looks_like_sam3d"),
+        _points("poise.formats.sam3d:json_points"),
     ),
     Reader(
         "TRC keypoints",

@@ -179,7 +179,15 @@ def decode(line: bytes, path: Path, number: int) -> str:
 
 
 def json_object(data: bytes, path: Path) -> dict[str, Any]:
-    """The JSON object in a file's bytes; brackets and commas are counted before memory is taken."""
+    """The JSON object in a file's bytes, see `json_value`."""
+    content = json_value(data, path)
+    if not isinstance(content, dict):
+        raise PoiseError("the JSON is no object", path, code="not-an-object")
+    return content
+
+
+def json_value(data: bytes, path: Path) -> Any:
+    """The JSON in a file's bytes; brackets and commas are counted before memory is taken."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     for size, most, what in (
         (len(data), MAX_JSON_BYTES, "bytes"),
@@ -194,7 +202,7 @@ def json_object(data: bytes, path: Path) -> dict[str, Any]:
                 code="over-limit",
             )
     try:
-        content = json.loads(data.decode("utf-8"))
+        return json.loads(data.decode("utf-8"))
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise PoiseError(
@@ -209,9 +217,6 @@ def json_object(data: bytes, path: Path) -> dict[str, Any]:
         ) from None
     except (RecursionError, ValueError):
         raise PoiseError("this is not valid JSON", path, code="bad-json") from None
-    if not isinstance(content, dict):
-        raise PoiseError("the JSON is no object", path, code="not-an-object")
-    return content
 
 
 def shown(token: object) -> str:

@@ -17,6 +17,7 @@ from poise.kinematics.retargeting.plant import FOLDED
 from poise.metrics import jerk
 from poise.motion import Clip, Skeleton
 from poise.motion.roles import SIDES, find_roles
+from poise.motion.smoothing import eased
 from toy_human import human, swing
 
 PLACE = RetargetConfig(hands="place")
@@ -193,3 +194,15 @@ def test_without_hands_directions_are_kept() -> None:
     plain, _ = retarget(clip, other)
     np.testing.assert_array_equal(made.rot, plain.rot)
     assert report.hands_percent is None
+
+
+def test_eased_keeps_what_is_slow_and_follows_no_more_than_it_must() -> None:
+    fps, t = 60.0, np.arange(240) / 60.0
+    slow, quick = np.sin(2 * np.pi * t)[:, None], 0.1 * np.sin(2 * np.pi * 15 * t)[:, None]
+    made = eased(slow + quick, np.ones(240), fps, 4.0)
+    np.testing.assert_allclose(made[20:-20], slow[20:-20], atol=2e-3)
+    # Where it counts for nothing the path goes on smoothly; where it counts for much it is followed.
+    weight = np.where(t < 2.0, 1e6, 0.0)
+    made = eased(slow + quick, weight, fps, 4.0)
+    np.testing.assert_allclose(made[:110], (slow + quick)[:110], atol=1e-3)
+    assert np.abs(np.diff(made[130:], 3, axis=0)).max() < 0.1 * np.abs(np.diff(quick, 3, axis=0)).max()

@@ -7,10 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from poise.kinematics.limbs import Limb
 from poise.kinematics.retargeting.passage import Retargeter, hip_middle
 from poise.kinematics.retargeting.standing import ClipWorld
 from poise.motion.roles import SIDES
-from poise.motion.smoothing import gaussian, smoothstep
+from poise.motion.rotations import quat_conj, quat_mul, quat_to_rotvec, rotvec_to_quat
+from poise.motion.skeleton import Skeleton
+from poise.motion.smoothing import eased, gaussian, smoothstep
 from poise.motion.vectors import norm
 
 #: Distance of a wrist from the middle of a part of the body, by the height of the hips, up to which the
@@ -22,6 +25,12 @@ _INSIDE = 0.05
 _CROWN = 0.2
 #: Deviation (s) of the bell by which the way of a hand beside what it goes with is smoothed.
 _CALM_S = 0.05
+#: Up to this (Hz) the elbow's turn follows what a wrist's place asks for.
+_ELBOW_HZ = 4.0
+#: Share of a bone that a wrist may be off, below which the turn stays as it is.
+_SLOW = 1e-3
+#: So many times more the turn counts where a hand is on the floor.
+_HELD = 1e3
 #: Bend (rad) of an elbow that arms do not exceed, unless the source's do.
 FOLDED = math.radians(150)
 
@@ -110,6 +119,48 @@ class HandPlaces:
         ]
         ends = [(nodes[a], nodes[b]) for a, b in lines if a in nodes and b in nodes]
         return [((a[0], b[0]), (a[1], b[1])) for a, b in ends]
+
+
+def calm_elbow(
+    skeleton: Skeleton,
+    before: np.ndarray,
+    rot: np.ndarray,
+    root: np.ndarray,
+    limb: Limb,
+    grounded: np.ndarray,
+    fps: float,
+    cyclic: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations `(T, J, 4)` wxyz whose elbow turns other than in `before` by a smooth path, and places
+    `(T, 3)` m for the wrist, as far from the shoulder as that elbow has it and in the same direction.
+
+    A bend moves the wrist of an arm (u, v) that spans d by |u x v| / d from the shoulder: the straighter
+    the arm, the less. So the path of the turn is followed as much as it moves the wrist (`eased`); near
+    full reach, where little way takes much bend, it is not. A hand that is `grounded (T)` stays there,
+    and a turn without anything quick stays as it is.
+    """
+    pos = skeleton.forward(root, rot)[0]
+    shoulder, elbow, wrist = (pos[:, j] for j in (limb.root, limb.mid, limb.end))
+    u, v, d = elbow - shoulder, wrist - elbow, wrist - shoulder
+    span = np.maximum(norm(d, keepdims=True), 1e-9)
+    slope = norm(np.cross(u, v)) / span[:, 0] / np.maximum(np.minimum(norm(u), norm(v)), 1e-9)
+    turn = quat_to_rotvec(quat_mul(quat_conj(before[:, limb.mid]), rot[:, limb.mid]))
+    out = rot.copy()
+    weight = np.minimum(slope, 1.0) ** 2 + _HELD * grounded
+    if cyclic and len(turn) > 1:
+        # The last frame of a cycle is the first one again: the middle one of three rounds.
+        once = len(turn) - 1
+        rounds, weights = np.tile(turn[:-1], (3, 1)), np.tile(weight[:-1], 3)
+        smooth = eased(rounds, weights, fps, _ELBOW_HZ)[once : 2 * once + 1]
+    else:
+        smooth = eased(turn, weight, fps, _ELBOW_HZ)
+    if float((slope * norm(smooth - turn)).max()) < _SLOW:
+        # Nothing quick is asked for.
+        return rot, wrist
+    calm = rotvec_to_quat(smooth)
+    out[:, limb.mid] = quat_mul(before[:, limb.mid], calm)
+    there = skeleton.forward(root, out)[0][:, limb.end]
+    return out, shoulder + d / span * norm(there - shoulder, keepdims=True)
 
 
 def _calm(path: np.ndarray, sigma: float, cyclic: bool) -> np.ndarray:

@@ -13,7 +13,7 @@ from poise.body.topology import subtree
 from poise.kinematics.feet import TOUCH_M, contact_labels
 from poise.kinematics.forward import carried
 from poise.kinematics.limbs import Limb, match_positions
-from poise.kinematics.retargeting.hands import FOLDED, HandPlaces
+from poise.kinematics.retargeting.hands import FOLDED, HandPlaces, calm_elbow
 from poise.kinematics.retargeting.passage import Retargeter
 from poise.kinematics.retargeting.standing import ClipWorld
 from poise.motion import Clip
@@ -113,7 +113,8 @@ def plant(
     While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
     after scaling: what stood still stands still. Limbs that would then be under the floor by more than
     in the source are lifted; where trunk, knees or elbows are, or a limb does not reach, the whole body
-    is. The limbs are solved by two bones in closed form; feet and hands keep their turn.
+    is. The limbs are solved by two bones in closed form; feet and hands keep their turn. Elbows of hands
+    that keep their places bend smoothly (`calm_elbow`).
     """
     skeleton, scale = passage.joints.target.skeleton, passage.scale
     depth = passage.here.depth(world, scale.ground) * scale.factor
@@ -156,6 +157,7 @@ def plant(
     by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
     rot = match_positions(skeleton, rot, root, goals, by_end)
     kept: dict[str, np.ndarray] = {}
+    before = rot
     for _ in range(ROUNDS if hands and places else 0):
         assert places is not None
         pos, quat = skeleton.forward(root, rot)
@@ -165,6 +167,10 @@ def plant(
             kept[foot.name] = lifted(k, goal, pos, quat)
         goals = {feet[k].target: kept[feet[k].name] for k in hands}
         rot = match_positions(skeleton, rot, root, goals, by_end, soft=SOFT_ARM, fold=FOLDED)
+    for k in hands:
+        foot, grounded = feet[k], contact_weight(contacts[:, k], clip.fps)
+        rot, goal = calm_elbow(skeleton, before, rot, root, foot.limb, grounded, clip.fps, clip.cyclic)
+        rot = match_positions(skeleton, rot, root, {foot.target: goal}, by_end)
     if clear:
         pos, quat = skeleton.forward(root, rot)
         up = np.zeros_like(root)

@@ -9,6 +9,17 @@ from typing import Any
 from poise.live.open.actions import Action
 from poise.live.open.job_processes import PageJob
 
+#: Hints for the codes of errors that the page has a control for, in place of the command line's.
+REMEDIES = {
+    "pickle-refused": "Numbers are taken out of it, and no code in it runs",
+    "rate-missing": "State its frames per second",
+}
+
+
+def code_of(job: PageJob) -> str:
+    """The code of a job's error; "" where it has none."""
+    return str((job.answer().get("error") or {}).get("code") or "")
+
 
 def problem_of(job: PageJob) -> str:
     """Why a job has no result, in a sentence; "" where it has one."""
@@ -19,7 +30,7 @@ def problem_of(job: PageJob) -> str:
     if not error:
         return ""
     what = " ".join(str(error.get(k) or "") for k in ("what",)).strip()
-    hint = str(error.get("hint") or "").strip()
+    hint = REMEDIES.get(code_of(job)) or str(error.get("hint") or "").strip()
     return f"{what[:1].upper()}{what[1:]}.{f' {hint}.' if hint else ''}"
 
 

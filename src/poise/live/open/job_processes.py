@@ -209,7 +209,9 @@ class Workers:
         if jobs:
             self._idle = time.monotonic()
         elif self._heavy and self._spare is None and time.monotonic() - self._idle > IDLE_S:
-            self._spare = self._waiting()
+            # One that cannot begin, such as when Ctrl-C ends the process it comes from, is no loss.
+            with contextlib.suppress(OSError, EOFError):
+                self._spare = self._waiting()
         for job in jobs:
             if job.state in ("running", "stopping"):
                 new |= self._progress(job)

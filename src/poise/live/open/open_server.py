@@ -31,7 +31,7 @@ from poise.live.open.actions import (
     told,
     words_of,
 )
-from poise.live.open.answers import motion_of, problem_of, sentences
+from poise.live.open.answers import code_of, motion_of, problem_of, sentences
 from poise.live.open.job_processes import DRAWN, PageJob, Workers, drawn_since
 from poise.live.open.project import LARGEST, Project, ProjectTake, clean_name, safe_file, write_json
 from poise.live.open.project_lock import ProjectLock
@@ -161,7 +161,7 @@ class OpenServer:
         self._looking[number] = self._looking.get(number, 1) - 1
         problem = problem_of(job)
         if problem and number in self.project.takes:
-            self._tell("refused", problem, number)
+            self._tell("refused", problem, number, code=code_of(job))
 
     def _worked(self, job: PageJob) -> None:
         about = job.about

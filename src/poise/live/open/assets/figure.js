@@ -1,4 +1,11 @@
 "use strict";
+// Colours of the page by their names, kept until the theme changes.
+const colorsHeld = new Map();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => colorsHeld.clear());
+function pageColor(name) {
+  if (!colorsHeld.has(name)) colorsHeld.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return colorsHeld.get(name);
+}
 // A motion as the page draws it: places of joints and bone tips, m, Z up, at the rate of its file.
 function decodeFigure(buffer) {
   const size = new DataView(buffer).getUint32(0, true);

@@ -5,7 +5,7 @@
   const V = 1;
   let socket = null, hello = null, project = null, view = null, line = null, forms = null, wait = 400;
   let frame = 0, playing = 0, last = performance.now(), fault = -1, range = null, seen = null, joint = null, redo = [];
-  let opened = null, drag = null, compare = "", asked = "", drawn = [], dirty = true, growing = null;
+  let opened = null, drag = null, compare = "", asked = "", drawn = [], dirty = true, growing = null, unread = false;
   const motions = new Map(), kept = new Map();
   const token = new URLSearchParams(location.search).get("token");
   // The browser keeps it as a cookie; the address need not show it.
@@ -107,20 +107,39 @@
     if (event.kind === "rests") {
       if (event.boxes.length) {
         forms.get("chair").set("boxes", event.boxes.map((b) => ({ kind: b.kind, size: b.size, pos: b.pos, yaw: b.yaw })));
+        // The moment that the box is about, in its middle.
+        const rest = judged(event.take) && judged(event.take).faults.find((f) => f.kind === "support missing");
+        if (rest && event.take === current()) { play(0); seek(Math.round((rest.start + rest.stop) / 2)); }
         toast("Found. Drag the box if it stands wrong, then press Put a chair.");
       } else toast(`${event.text} Add a seat if there should be one.`);
     } else if (event.kind === "exported") {
       const link = make("a", { href: `/export/${event.file}`, download: "" });
       link.click();
       toast(event.text);
-    } else if (event.kind === "refused") problem(event.text);
+    } else if (event.kind === "refused") problem(event.text, remedy(event));
     else if (event.text) toast(event.text, event.kind);
   }
 
+  // Controls that mend how a file is read, where its error has one.
+  function remedy({ code, take: id }) {
+    const t = take(id);
+    if (!t) return [];
+    const read = (values) => { problem(""); send({ type: "reading", take: id, values: { ...stated(t), ...values() } }); };
+    const button = (values) => make("button", { className: "main", textContent: "Read it", onclick: () => read(values) });
+    if (code === "pickle-refused") return [button(() => ({ allow_pickle: true }))];
+    if (code !== "rate-missing") return [];
+    const rate = make("input", { type: "number", min: 1, max: 1000, step: "any", value: 30 });
+    rate.setAttribute("aria-label", "Frames per second");
+    return [rate, button(() => ({ fps: Number(rate.value) }))];
+  }
+  // What only the command line can state stays.
+  const stated = (t) => Object.fromEntries(Object.entries(t.reading).filter(([k]) => k in hello.reading));
+
   // What went wrong stays until it is read.
-  function problem(text) {
+  function problem(text, cure = []) {
     $("problem").hidden = !text;
-    $("problem").replaceChildren(make("div", { textContent: text }), make("button", { className: "plain", textContent: "Close", onclick: () => problem("") }));
+    const close = make("button", { className: "plain", textContent: "Close", onclick: () => problem("") });
+    $("problem").replaceChildren(make("div", { textContent: text }), make("div", { className: "row" }, ...cure, close));
     if (text) $("right").scrollTop = 0;
   }
 
@@ -285,9 +304,11 @@
     }
   }
   function formats(m) {
-    const t = take(), own = m.home, all = Object.entries(hello.exports);
-    const came = t.suffix && hello.exports[rootSuffix(t)] ? rootSuffix(t) : own;
-    const options = [[came, `as it came in (${came.slice(1).toUpperCase()})`], ...all.filter(([s]) => s !== came).map(([s, text]) => [s, text])];
+    const root = rootSuffix(take()), all = Object.entries(hello.exports);
+    // A format that is only read goes out as BVH, which animators' tools take.
+    const came = hello.exports[root] ? root : [".glb", ".usda"].includes(m.home) ? m.home : "";
+    const first = came ? [[came, `as it came in (${came.slice(1).toUpperCase()})`]] : [];
+    const options = [...first, ...all.filter(([s]) => s !== came)];
     const words = JSON.stringify(options);
     if ($("format").dataset.words === words) return;
     $("format").dataset.words = words;
@@ -316,15 +337,17 @@
     if (!t || t.parent && !m) return;
     if (!m) {
       // It cannot be read: what is stated may help.
-      if ($("faulty").dataset.words === t.id) return;
-      $("faulty").dataset.words = t.id;
-      $("guessed").open = !t.looking;
+      const words = JSON.stringify([t.id, t.looking, t.reading]);
+      if ($("faulty").dataset.words === words) return;
+      $("faulty").dataset.words = words;
+      if (!t.looking && !t.figure) $("guessed").open = unread = true;
       $("guess-line").textContent = "it cannot be read so";
       return guesses(null, null, t);
     }
     const words = JSON.stringify([t.id, t.reading, t.figure, t.judged, Boolean(j)]);
     if ($("faulty").dataset.words === words) return;
     $("faulty").dataset.words = words;
+    if (unread && m) $("guessed").open = unread = false;
     $("guess-line").textContent = `${m.up_axis} up, ${unitName(m.unit_m)}, ${Number(m.fps.toPrecision(4))} Hz, ${m.height_m.toFixed(2)} m tall`;
     guesses(m, j, t);
     const alone = j ? j.faults.filter((f) => f.kind === "support missing").length : 0;
@@ -350,39 +373,38 @@
   const unitName = (u) => { const found = UNITS.find(([k]) => Math.abs(UNIT_M[k] / u - 1) < 1e-6); return found ? found[1] : `unit ${Number(u.toPrecision(4))} m`; };
   function guesses(m, j, t) {
     const of = (what) => (j ? j.guesses.find((g) => g.what === what) : null);
-    // What only the command line can state stays.
-    const stated = Object.fromEntries(Object.entries(t.reading).filter(([k]) => k in hello.reading));
-    const set = (name, value) => send({ type: "reading", take: t.id, values: { ...stated, [name]: value } });
+    const said = stated(t);
+    const set = (name, value) => send({ type: "reading", take: t.id, values: { ...said, [name]: value } });
     const one = (what, label, control) => {
       const g = of(what);
       return make("div", { className: "guess" }, make("label", {}, label, control), make("p", { textContent: g ? `${g.evidence}.` : "" }));
     };
     const auto = (name, options, now) => {
       const input = make("select", {}, new Option(`guessed${now ? `: ${now}` : ""}`, ""), ...options.map(([value, text]) => new Option(text, value)));
-      input.value = stated[name] === undefined ? "" : stated[name];
+      input.value = said[name] === undefined ? "" : said[name];
       input.onchange = () => set(name, input.value);
       return input;
     };
-    const rate = make("input", { type: "number", min: 1, max: 1000, step: "any", placeholder: m ? String(Number(m.fps.toPrecision(6))) : "", value: stated.fps || "" });
+    const rate = make("input", { type: "number", min: 1, max: 1000, step: "any", placeholder: m ? String(Number(m.fps.toPrecision(6))) : "", value: said.fps || "" });
     rate.onchange = () => set("fps", rate.value === "" ? null : Number(rate.value));
-    const sides = make("input", { type: "checkbox", checked: Boolean(stated.swap_sides) });
+    const sides = make("input", { type: "checkbox", checked: Boolean(said.swap_sides) });
     sides.onchange = () => set("swap_sides", sides.checked);
-    const raw = make("input", { type: "checkbox", checked: Boolean(stated.raw) });
+    const raw = make("input", { type: "checkbox", checked: Boolean(said.raw) });
     raw.onchange = () => set("raw", raw.checked);
     const floor = make("select", {}, new Option("as in the file", ""), new Option("where the soles are", "auto"));
-    floor.value = stated.ground || "";
+    floor.value = said.ground || "";
     floor.onchange = () => set("ground", floor.value);
     const rows = [
-      one("up", "Up", auto("up", hello.reading.up.map((u) => [u, u]), stated.up || !m ? "" : m.up_axis)),
-      one("unit", "Unit", auto("unit", UNITS, stated.unit || !m ? "" : unitName(m.unit_m))),
+      one("up", "Up", auto("up", hello.reading.up.map((u) => [u, u]), said.up || !m ? "" : m.up_axis)),
+      one("unit", "Unit", auto("unit", UNITS, said.unit || !m ? "" : unitName(m.unit_m))),
       one("fps", "Rate, Hz", rate), one("ground", "Floor", floor), one("sides", "Swap sides", sides),
       make("div", { className: "guess" }, make("label", { title: "No tremble is taken off" }, "As it is", raw)),
     ];
-    const pickled = make("input", { type: "checkbox", checked: Boolean(stated.allow_pickle) });
+    const pickled = make("input", { type: "checkbox", checked: Boolean(said.allow_pickle) });
     pickled.onchange = () => set("allow_pickle", pickled.checked);
-    if (!m || stated.allow_pickle) rows.push(make("div", { className: "guess" }, make("label", { title: "Plain arrays are taken out of it; no code of its runs" }, "Pickled", pickled)));
-    if (!m || m.format.includes("csv") || j && j.notes.some((n) => /animation|people|person/.test(n)) || stated.take) {
-      const which = make("input", { type: "text", value: stated.take || "", placeholder: "name or number" });
+    if (!m || said.allow_pickle) rows.push(make("div", { className: "guess" }, make("label", { title: "Plain arrays are taken out of it; no code of its runs" }, "Pickled", pickled)));
+    if (!m || m.format.includes("csv") || j && j.notes.some((n) => /animation|people|person/.test(n)) || said.take) {
+      const which = make("input", { type: "text", value: said.take || "", placeholder: "name or number" });
       which.onchange = () => set("take", which.value);
       rows.push(make("div", { className: "guess" }, make("label", {}, "Take", which)));
     }
@@ -398,8 +420,8 @@
     if (growing && to !== growing.at) growing.led = false;
     frame = Math.min(Math.max(to, 0), m.frames - 1);
     const moment = `frame ${Math.round(frame)} of ${m.frames - 1}, ${(frame / m.fps).toFixed(2)} s`;
-    $("time").textContent = moment;
-    line.frame(frame, moment);
+    if ($("time").textContent !== moment) $("time").textContent = moment;
+    line.frame(frame, moment, Boolean(playing));
     dirty = true;
     if (!playing && opened && opened.action.name === "push") pushMoment();
   }
@@ -469,7 +491,7 @@
 
   // Marks over the picture: trails of the feet, the chosen joint, pins, an arrow.
   function marks(ink, screen, places) {
-    const m = motion(), css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+    const m = motion(), css = pageColor;
     if (!m) return;
     const dot = (x, y, r, color, ring) => {
       ink.beginPath();
@@ -485,20 +507,24 @@
         if (foot === undefined) continue;
         const runs = j ? (j.contacts.find((c) => c.joint === whose) || { runs: [] }).runs : [];
         const half = Math.round(1.2 * m.fps), each = Math.max(1, Math.round(m.fps / 60));
+        // Pieces of one kind are drawn at once: fainter ones are farther in time.
+        const pieces = new Map();
         let from = null;
         for (let t = Math.max(0, Math.round(frame) - half); t <= Math.min(m.frames - 1, Math.round(frame) + half); t += each) {
           const [x, y, z] = m.place(t, foot), at = screen(x, y, z);
-          const stands = runs.some(([a, b]) => t >= a && t <= b);
+          const stands = runs.some(([a, b]) => t >= a && t <= b), kind = 2 * Math.floor((5 * Math.abs(t - frame)) / (half + 1)) + stands;
           if (from && at) {
-            ink.strokeStyle = stands ? css("--contact") : css(side === "left" ? "--left" : "--right");
-            ink.globalAlpha = 0.25 + 0.6 * (1 - Math.abs(t - frame) / half);
-            ink.lineWidth = stands ? 4 : 1.6;
-            ink.beginPath();
-            ink.moveTo(from[0], from[1]);
-            ink.lineTo(at[0], at[1]);
-            ink.stroke();
+            if (!pieces.has(kind)) pieces.set(kind, new Path2D());
+            pieces.get(kind).moveTo(from[0], from[1]);
+            pieces.get(kind).lineTo(at[0], at[1]);
           }
           from = at;
+        }
+        for (const [kind, path] of pieces) {
+          ink.strokeStyle = css(kind % 2 ? "--contact" : side === "left" ? "--left" : "--right");
+          ink.globalAlpha = 0.85 - 0.13 * (kind >> 1);
+          ink.lineWidth = kind % 2 ? 4 : 1.6;
+          ink.stroke(path);
         }
       }
       ink.globalAlpha = 1;
@@ -833,7 +859,7 @@
   });
 
   window.poiseOpen = {
-    get state() { return { frame, playing, current: current(), compare, joint, range, fault, project, made: made() && [made().first, made().last], motion: motion(), judged: judged() }; },
+    get state() { return { frame, playing, current: current(), compare, joint, range, fault, project, made: made() && [made().first, made().last], motion: motion(), judged: judged(), calls: view ? view.calls : 0 }; },
     seek, screen: (j) => view.screen(view.places[3 * j], view.places[3 * j + 1], view.places[3 * j + 2]), forms: () => forms,
   };
   connect();

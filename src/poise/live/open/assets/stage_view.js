@@ -1,26 +1,31 @@
 "use strict";
 // The motion on the shared stage: one figure, another beside or over it, boxes, and marks drawn over all.
 function stageView(host, over) {
+  const plain = drawnBySoftware();
   const base = threeStage(host, {
-    fov: 30, polar: 1.56, far: 60, reach: 5, depth: 26, fade: [2, 14], fog: [18, 60], sunAt: [2.4, -3, 8], detail: 10,
+    fov: 30, polar: 1.56, far: 60, reach: 5, depth: 26, fade: [2, 14], fog: plain ? [6, 14] : [18, 60], sunAt: [2.4, -3, 8], detail: 10, plain,
   });
-  const { T, css, scene, camera, controls, place, solid } = base;
+  const { T, scene, camera, controls } = base, css = pageColor;
   for (const canvas of [base.canvas, over]) canvas.setAttribute("aria-hidden", "true");
   controls.dampingFactor = 0.14;
   camera.position.set(3.6, -3.6, 2.2);
   controls.target.set(0, 0, 0.9);
   const point = new T.Vector3(), ink = over.getContext("2d");
-  const materials = () => ["", "left", "right"].map(() => new T.MeshStandardMaterial({ roughness: 0.6 }));
-  const ghostly = () => ["", "left", "right"].map(() => new T.MeshBasicMaterial({ transparent: true, opacity: 0.34, depthWrite: false }));
+  const skin = () => (plain ? new T.MeshLambertMaterial() : new T.MeshStandardMaterial({ roughness: 0.6 }));
+  // A ghost is drawn twice, first into the depth buffer alone, so that its inner parts stay hidden.
+  const veil = new T.MeshBasicMaterial({ colorWrite: false });
+  const ghostly = () => new T.MeshBasicMaterial({ transparent: true, opacity: 0.34 });
+  const [ball, tube] = plain ? [new T.SphereGeometry(1, 10, 7), new T.CylinderGeometry(1, 1, 1, 10, 1, true)]
+    : [new T.SphereGeometry(1, 24, 16), new T.CylinderGeometry(1, 1, 1, 24, 1, true)];
+  tube.rotateX(Math.PI / 2);
   const wood = new T.MeshStandardMaterial({ roughness: 0.9 });
   const shown = { a: null, b: null, c: null };
   let boxes = [], target = new T.Vector3(0, 0, 0.9), placed = false, moved = new T.Vector3();
 
-  // A figure of bones as capsules, and a head.
+  // A figure of bones as capsules, and a head: all balls are drawn at once, and all tubes.
   function figure(motion, ghost) {
-    const mats = ghost ? ghostly() : materials();
     const first = motion.at(0, new Float32Array(3 * motion.J));
-    const shapes = [];
+    const bones = [];
     motion.parents.forEach((parent, joint) => {
       // The head's own bones lie inside of it.
       if (parent < 0 || parent === motion.head) return;
@@ -28,19 +33,27 @@ function stageView(host, over) {
       const length = Math.hypot(first[i] - first[p], first[i + 1] - first[p + 1], first[i + 2] - first[p + 2]);
       if (length < 1e-4) return;
       const radius = Math.min(motion.radii[joint], Math.max(0.45 * length, 0.006));
-      const half = Math.max(length / 2 - 0.35 * radius, 0.001);
-      shapes.push({ joint, parent, kind: "capsule", size: [radius, half, 0], pos: [0, 0, 0], quat: [1, 0, 0, 0], body: shapes.length });
+      bones.push({ joint, parent, radius, half: Math.max(length / 2 - 0.35 * radius, 0.001) });
     });
-    if (motion.head !== null)
-      shapes.push({ joint: motion.head, parent: crown(motion, first), head: true, kind: "sphere", size: [motion.head_m, 0, 0], pos: [0, 0, 0.6 * motion.head_m], quat: [1, 0, 0, 0], body: shapes.length });
-    const dress = (shape) => {
-      const side = motion.sides[shape.joint];
-      const mesh = solid(shape, mats[side === "left" ? 1 : side === "right" ? 2 : 0]);
-      mesh.castShadow = !ghost;
-      return [mesh];
+    if (motion.head !== null) bones.push({ joint: motion.head, parent: crown(motion, first), head: true, radius: motion.head_m });
+    const root = new T.Group(), tubes = bones.filter((b) => !b.head).length;
+    const layer = (material, order) => {
+      const made = [new T.InstancedMesh(ball, material, tubes + bones.length), new T.InstancedMesh(tube, material, tubes)];
+      for (const mesh of made) {
+        mesh.castShadow = material !== veil && !ghost;
+        mesh.receiveShadow = !ghost;
+        mesh.frustumCulled = false;
+        mesh.renderOrder = order;
+        mesh.instanceMatrix.setUsage(T.DynamicDrawUsage);
+      }
+      root.add(...made);
+      return made;
     };
-    const made = base.figure(shapes, shapes, dress);
-    return { ...made, mats, shapes, motion, at: new Float32Array(3 * motion.J), ghost };
+    const material = ghost ? ghostly() : skin();
+    const [balls, rods] = layer(material, ghost ? 2 : 0);
+    if (ghost) layer(veil, 1).forEach((mesh, k) => { mesh.instanceMatrix = [balls, rods][k].instanceMatrix; });
+    scene.add(root);
+    return { root, balls, rods, material, bones, motion, at: new Float32Array(3 * motion.J), ghost };
   }
   // The joint to which a head points, negative for one from which it comes: its tip, or the neck.
   function crown(motion, at) {
@@ -51,36 +64,62 @@ function stageView(host, over) {
   function drop(who) {
     if (!who) return;
     scene.remove(who.root);
-    who.root.traverse((mesh) => mesh.geometry && mesh.geometry.dispose());
-    who.mats.forEach((m) => m.dispose());
+    for (const mesh of who.root.children) mesh.dispose();
+    who.material.dispose();
   }
-  const rows = new Float32Array(7);
+  // Three axes and a place as a matrix of an instance.
+  function set(out, k, ux, uy, uz, vx, vy, vz, wx, wy, wz, x, y, z) {
+    const i = 16 * k;
+    out[i] = ux; out[i + 1] = uy; out[i + 2] = uz; out[i + 3] = 0;
+    out[i + 4] = vx; out[i + 5] = vy; out[i + 6] = vz; out[i + 7] = 0;
+    out[i + 8] = wx; out[i + 9] = wy; out[i + 10] = wz; out[i + 11] = 0;
+    out[i + 12] = x; out[i + 13] = y; out[i + 14] = z; out[i + 15] = 1;
+  }
   function pose(who, frame, dx, dy) {
-    const at = who.motion.at(frame, who.at);
+    const at = who.motion.at(frame, who.at), balls = who.balls.instanceMatrix, rods = who.rods.instanceMatrix;
     who.root.position.set(dx, dy, 0);
-    who.shapes.forEach((shape, k) => {
-      const ahead = shape.head && shape.parent < -1, i = 3 * shape.joint, p = 3 * (ahead ? ~shape.parent : shape.parent);
-      const sign = ahead ? -1 : 1;
-      let [x, y, z] = shape.parent === -1 ? [0, 0, 1] : [sign * (at[i] - at[p]), sign * (at[i + 1] - at[p + 1]), sign * (at[i + 2] - at[p + 2])];
+    let b = 0, r = 0;
+    for (const bone of who.bones) {
+      const ahead = bone.head && bone.parent < -1, i = 3 * bone.joint, p = 3 * (ahead ? ~bone.parent : bone.parent);
+      const sign = ahead ? -1 : 1, a = bone.radius;
+      let x = 0, y = 0, z = 1;
+      if (bone.parent !== -1) { x = sign * (at[i] - at[p]); y = sign * (at[i + 1] - at[p + 1]); z = sign * (at[i + 2] - at[p + 2]); }
       const n = Math.hypot(x, y, z) || 1;
-      [x, y, z] = [x / n, y / n, z / n];
+      x /= n; y /= n; z /= n;
+      if (bone.head) {
+        set(balls.array, b++, a, 0, 0, 0, a, 0, 0, 0, a, at[i] + 0.6 * a * x, at[i + 1] + 0.6 * a * y, at[i + 2] + 0.6 * a * z);
+        continue;
+      }
       // The shortest turn from Z onto the bone.
-      let [w, qx, qy] = [1 + z, -y, x];
-      if (w < 1e-5) [w, qx, qy] = [0, 1, 0];
-      const q = Math.hypot(w, qx, qy);
-      if (shape.head) rows.set([at[i], at[i + 1], at[i + 2]]);
-      else rows.set([(at[i] + at[p]) / 2, (at[i + 1] + at[p + 1]) / 2, (at[i + 2] + at[p + 2]) / 2]);
-      rows.set([w / q, qx / q, qy / q, 0], 3);
-      place(who.parts[k], rows, 0);
-    });
+      const s = 1 + z < 1e-5 ? 0 : 1 / (1 + z), h = bone.half;
+      const [ux, uy, vx, vy] = s ? [1 - x * x * s, -x * y * s, -x * y * s, 1 - y * y * s] : [1, 0, 0, -1];
+      const mx = (at[i] + at[p]) / 2, my = (at[i + 1] + at[p + 1]) / 2, mz = (at[i + 2] + at[p + 2]) / 2;
+      set(rods.array, r++, a * ux, a * uy, -a * x, a * vx, a * vy, -a * y, 2 * h * x, 2 * h * y, 2 * h * z, mx, my, mz);
+      set(balls.array, b++, a, 0, 0, 0, a, 0, 0, 0, a, mx + h * x, my + h * y, mz + h * z);
+      set(balls.array, b++, a, 0, 0, 0, a, 0, 0, 0, a, mx - h * x, my - h * y, mz - h * z);
+    }
+    balls.needsUpdate = rods.needsUpdate = true;
+  }
+  const tint = new T.Color();
+  function paint(who) {
+    if (who.ghost) return who.material.color.set(css("--ref"));
+    const names = { left: css("--left"), right: css("--right") }, other = css("--sim");
+    let b = 0, r = 0;
+    for (const bone of who.bones) {
+      tint.set(names[who.motion.sides[bone.joint]] || other);
+      who.balls.setColorAt(b++, tint);
+      if (bone.head) continue;
+      who.balls.setColorAt(b++, tint);
+      who.rods.setColorAt(r++, tint);
+    }
+    who.balls.instanceColor.needsUpdate = who.rods.instanceColor.needsUpdate = true;
   }
   const view = {
     canvas: base.canvas, camera, controls,
     theme() {
       base.theme("--bg");
       wood.color.set(css("--thing"));
-      for (const who of [shown.a, shown.b, shown.c])
-        if (who) (who.ghost ? ["--ref", "--ref", "--rim"] : ["--sim", "--left", "--right"]).forEach((name, k) => who.mats[k].color.set(css(name)));
+      for (const who of [shown.a, shown.b, shown.c]) if (who) paint(who);
     },
     resize() {
       const [w, h] = [host.clientWidth, Math.max(host.clientHeight, 1)];
@@ -96,8 +135,8 @@ function stageView(host, over) {
         if (shown[name] ? shown[name].motion === motion && shown[name].ghost === ghost : !motion) continue;
         drop(shown[name]);
         shown[name] = motion ? figure(motion, ghost) : null;
+        if (motion) paint(shown[name]);
       }
-      view.theme();
     },
     // Has something called whenever another picture is to be drawn.
     changed(call) {
@@ -195,6 +234,8 @@ function stageView(host, over) {
       });
       return best;
     },
+    // Calls of the last picture.
+    get calls() { return base.renderer.info.render.calls; },
     get places() { return shown.a ? shown.a.at : null; },
   };
   view.theme();

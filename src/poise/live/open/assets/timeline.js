@@ -1,10 +1,10 @@
 "use strict";
 // The timeline: frames, marks of faults, contacts of the feet, frames that stay, a range, and a curve.
 function timelineView(canvas, acts) {
-  const ink = canvas.getContext("2d");
-  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  // What does not change while time goes on is drawn once, below the playhead.
+  const front = canvas.getContext("2d"), under = document.createElement("canvas"), ink = under.getContext("2d"), css = pageColor;
   const RULER = 20, ROW = 9, PAD = 10;
-  let state = null, span = [0, 1], marks = [], drag = null;
+  let state = null, span = [0, 1], marks = [], drag = null, told = 0;
   const wide = () => canvas.clientWidth - 2 * PAD;
   const toX = (frame) => PAD + ((frame - span[0]) / (span[1] - span[0] || 1)) * wide();
   const toFrame = (x) => {
@@ -15,13 +15,31 @@ function timelineView(canvas, acts) {
 
   function resize() {
     const ratio = Math.min(devicePixelRatio || 1, 2);
-    canvas.width = canvas.clientWidth * ratio;
-    canvas.height = canvas.clientHeight * ratio;
-    ink.setTransform(ratio, 0, 0, ratio, 0, 0);
+    canvas.width = under.width = canvas.clientWidth * ratio;
+    canvas.height = under.height = canvas.clientHeight * ratio;
+    for (const one of [ink, front]) one.setTransform(ratio, 0, 0, ratio, 0, 0);
     draw();
   }
   function draw() {
     if (!canvas.clientWidth) return;
+    ground();
+    head();
+  }
+  function head() {
+    if (!under.width || !under.height) return;
+    const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+    front.drawImage(under, 0, 0, w, h);
+    if (!state) return;
+    const x = toX(state.frame);
+    front.fillStyle = css("--push");
+    front.fillRect(x - 1, 0, 2, h);
+    front.beginPath();
+    front.moveTo(x - 6, 0);
+    front.lineTo(x + 6, 0);
+    front.lineTo(x, 8);
+    front.fill();
+  }
+  function ground() {
     const [w, h] = [canvas.clientWidth, canvas.clientHeight];
     ink.clearRect(0, 0, w, h);
     ink.fillStyle = css("--track");
@@ -98,14 +116,6 @@ function timelineView(canvas, acts) {
       ink.lineTo(x - 5, RULER - 5);
       ink.fill();
     }
-    const x = toX(state.frame);
-    ink.fillStyle = css("--push");
-    ink.fillRect(x - 1, 0, 2, h);
-    ink.beginPath();
-    ink.moveTo(x - 6, 0);
-    ink.lineTo(x + 6, 0);
-    ink.lineTo(x, 8);
-    ink.fill();
   }
   function curves(top, bottom) {
     if (bottom - top < 16 || !state.curves.length) return;
@@ -175,16 +185,21 @@ function timelineView(canvas, acts) {
       if (state && !same) span = [0, Math.max(state.frames - 1, 1)];
       draw();
     },
-    frame(frame, moment) {
+    // hushed: says the frame to screen readers a few times a second at most, since it plays.
+    frame(frame, moment, hushed) {
       if (!state) return;
       state.frame = frame;
       // What plays stays in view.
-      if (frame > span[1] || frame < span[0]) {
+      const out = frame > span[1] || frame < span[0];
+      if (out) {
         const length = span[1] - span[0];
         const from = Math.min(Math.max(frame - 0.1 * length, 0), Math.max(state.frames - 1 - length, 0));
         span = [from, from + length];
       }
-      draw();
+      if (out) draw();
+      else head();
+      if (hushed && performance.now() - told < 400) return;
+      told = performance.now();
       canvas.setAttribute("aria-valuemax", state.frames - 1);
       canvas.setAttribute("aria-valuenow", Math.round(frame));
       const now = Math.round(frame), here = state.faults.filter((f) => f.start <= now && now <= f.stop).slice(0, 3);

@@ -1,11 +1,12 @@
 // The stage of the report and of the live page, in three.js: light, floor, camera, and figures of bodies.
-function threeStage(host, { fov, polar, far, reach, depth, fade, fog, sunAt, detail }) {
+// plain: without shadows and smooth edges, and lines as floor, for who draws without a GPU.
+function threeStage(host, { fov, polar, far, reach, depth, fade, fog, sunAt, detail, plain = false }) {
   const T = THREE;
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const canvas = document.createElement("canvas");
-  const renderer = new T.WebGLRenderer({ canvas, antialias: true, alpha: false });
-  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-  renderer.shadowMap.enabled = true;
+  const renderer = new T.WebGLRenderer({ canvas, antialias: !plain, alpha: false });
+  renderer.setPixelRatio(plain ? 1 : Math.min(window.devicePixelRatio || 1, 2));
+  renderer.shadowMap.enabled = !plain;
   host.prepend(canvas);
   const scene = new T.Scene();
   const camera = new T.PerspectiveCamera(fov, 1, 0.05, 200);
@@ -45,11 +46,19 @@ function threeStage(host, { fov, polar, far, reach, depth, fade, fog, sunAt, det
       }`,
   });
   const plane = new T.PlaneGeometry(60, 60);
-  const floor = new T.Mesh(plane, grid);
+  const lines = new T.LineBasicMaterial({ transparent: true });
+  const floor = plain ? new T.LineSegments(metres(12), lines) : new T.Mesh(plane, grid);
   const shade = new T.Mesh(plane, new T.ShadowMaterial({ opacity: 0.2 }));
   floor.position.z = 0.001;
   shade.receiveShadow = true;
-  scene.add(shade, floor);
+  scene.add(floor);
+  if (!plain) scene.add(shade);
+  // A line for each metre, both ways, in pieces, since long lines that pass the camera are not drawn.
+  function metres(far) {
+    const ends = [];
+    for (let k = -far; k <= far; k++) for (let i = -far; i < far; i += 2) ends.push(k, i, 0, k, i + 2, 0, i, k, 0, i + 2, k, 0);
+    return new T.BufferGeometry().setAttribute("position", new T.Float32BufferAttribute(ends, 3));
+  }
 
   const place = (group, rows, at) => {
     group.position.set(rows[at], rows[at + 1], rows[at + 2]);
@@ -88,7 +97,8 @@ function threeStage(host, { fov, polar, far, reach, depth, fade, fog, sunAt, det
       scene.background = new T.Color(css(background));
       scene.fog = new T.Fog(scene.background, ...fog);
       grid.uniforms.ink.value.set(css("--ink"));
-      grid.uniforms.strength.value = parseFloat(css("--grid")) || 0.2;
+      grid.uniforms.strength.value = lines.opacity = parseFloat(css("--grid")) || 0.2;
+      lines.color.set(css("--ink"));
       shade.material.opacity = parseFloat(css("--shade")) || 0.2;
     },
     resize(width, height) {
@@ -101,9 +111,20 @@ function threeStage(host, { fov, polar, far, reach, depth, fade, fog, sunAt, det
       sun.target.position.set(at.x, at.y, 0);
       sun.position.set(at.x + sunAt[0], at.y + sunAt[1], sunAt[2]);
       grid.uniforms.center.value.copy(at);
-      floor.position.x = shade.position.x = at.x;
-      floor.position.y = shade.position.y = at.y;
+      shade.position.x = at.x;
+      shade.position.y = at.y;
+      // Lines stay on whole metres.
+      floor.position.x = plain ? Math.round(at.x) : at.x;
+      floor.position.y = plain ? Math.round(at.y) : at.y;
       renderer.render(scene, camera);
     },
   };
+}
+// Whether this browser draws with the processor alone.
+function drawnBySoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const told = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  if (gl) gl.getExtension("WEBGL_lose_context").loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
