@@ -296,7 +296,8 @@ class _Seen:
         """What a hand gave with up to `limit` N and N m, to characters of `mass` kg."""
         if not self._helped:
             return NO_HELP
-        found = help_audit(*torch.stack(self._helped, 1), mass)
+        force, torque, goes, spins = torch.stack(self._helped, 1).unbind(0)
+        found = help_audit(force, torque, goes, spins, mass)
         names = ("force_mean_n", "force_p95_n", "torque_mean_nm", "torque_p95_nm", "work_j_per_s")
         used = (getattr(found, name) for name in (*names, "share_of_body_weight"))
         return Help(limit, limit, *used)
