@@ -50,7 +50,7 @@ CLEAR = 0.35
 OFF_COST, FARTHEST_COST, LATE_COST = 2.0, 1.0, 0.5
 #: m/s at which a path is to be followed at least, where no speed is wished for; rad/s and m/s with which
 #: what walks turns along it.
-GOES_ON, BEND, WALKS = 1.4, 1.0, 0.8
+GOES_ON, BEND, WALKS = 1.1, 1.0, 0.8
 #: Futures that are proposed where one is chosen: to get somewhere, on a path or where others are in the
 #: way, and to keep apart alone.
 PROPOSALS, SOME, FEW = 240, 96, 24

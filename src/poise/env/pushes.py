@@ -214,7 +214,7 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
         force = torch.stack((size * angle.cos(), size * angle.sin(), 0 * size), 1)
         if isinstance(self.direction, tuple):
             way = torch.tensor(self.direction)
-            force = size.unsqueeze(1) * way / torch.linalg.vector_norm(way)
+            force = size.unsqueeze(1) * way / way.square().sum().sqrt()
         steps = (wait * self.control_hz).round().clamp(1, NEVER)
         self.left[ids] = steps.long().to(self.left.device)
         self.lasts[ids] = (lasts * self.control_hz).round().long().clamp_min(1).to(self.left.device)
@@ -227,6 +227,6 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
         left = quat_rotate(quat, self._to_left.expand(len(quat), 3))
         # Forward is left x up.
         back = torch.stack((-left[:, 1], left[:, 0], torch.zeros_like(left[:, 0])), 1)
-        size = torch.linalg.vector_norm(back, dim=-1, keepdim=True).clamp_min(1e-6)
-        newtons = torch.linalg.vector_norm(self.force[rows], dim=-1, keepdim=True)
+        size = back.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-6)
+        newtons = self.force[rows].square().sum(-1, keepdim=True).sqrt()
         return (back / size * newtons).to(self.force)
