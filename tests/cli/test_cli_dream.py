@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from poise.cli.dream import targets_of
+from poise.cli.dream import points_of, push_of
 from poise.cli.main import main
 from poise.formats import read_clip, write_clip
+from poise.jobs.endless.dream_world import DreamPush
 from poise.jobs.endless.endless_training import Endless
 from poise.learn.cvae import CVAEConfig
 from poise.settings import to_toml
@@ -45,6 +46,16 @@ def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (["--generator", "none"], "could not be read"),
         (["--past", "none"], "--past"),
         (["--loop", "50"], "Give --seconds 200"),
+        (["--path", "5,0"], "points must have at least 2"),
+        (["--path", "0,0 0.2,0"], "at least 1 m long"),
+        (["--pace", "1"], "Give a path"),
+        (["--path", "0,0 5,0", "--pace", "9"], "speed must lie in 0.3 to 3 m/s"),
+        (["--path", "0,0 5,0", "--steer", "1,1"], "Leave one of them out"),
+        (["--scene", "none.json"], "none.json: cannot be read"),
+        (["--push", "force"], "'force' makes no push"),
+        (["--push", "every=often"], "'every=often' has no number"),
+        (["--push", "direction=0,0,0"], "not all 0"),
+        (["--help-limit", "-1"], "--help-limit must lie in 0"),
     ],
 )
 def test_mistakes_are_one_sentence(
@@ -57,12 +68,21 @@ def test_mistakes_are_one_sentence(
 
 
 def test_points_stand_on_the_line_or_in_a_file(tmp_path: Path) -> None:
-    assert targets_of("5,0 -1.5,2") == ((5.0, 0.0), (-1.5, 2.0))
+    assert points_of("5,0 -1.5,2", "--steer") == ((5.0, 0.0), (-1.5, 2.0))
     (tmp_path / "way.txt").write_text("# there and back\n5, 0\n\n0,0  # home\n")
-    assert targets_of(str(tmp_path / "way.txt")) == ((5.0, 0.0), (0.0, 0.0))
+    assert points_of(str(tmp_path / "way.txt"), "--steer") == ((5.0, 0.0), (0.0, 0.0))
     (tmp_path / "way.txt").write_text("# nothing\n")
     with refused("out-of-range", says="0"):
-        targets_of(str(tmp_path / "way.txt"))
+        points_of(str(tmp_path / "way.txt"), "--steer")
+
+
+def test_a_push_is_said_in_words() -> None:
+    assert push_of("") == DreamPush()
+    made = push_of("at=chest force=200 from=5 seconds=0.2 direction=0,1,0 every=5-15")
+    assert made == DreamPush(200.0, "chest", 5.0, 0.2, (0.0, 1.0, 0.0), (5.0, 15.0))
+    assert push_of("direction=any every=10") == DreamPush(direction="any", every_s=(10.0, 10.0))
+    with refused("option-malformed", says="force=200"):
+        push_of("power=5")
 
 
 def test_a_generator_is_trained_and_gone_on_with(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 
 import pytest
 import torch
 
 from poise.env.events import Event
 from poise.env.pushes import Pushes
+from poise.jobs.track.pushed import from_the_front
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
@@ -127,6 +129,47 @@ def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> 
     impulse = (size * lasts)[lasts > 0.3]
     torch.testing.assert_close(impulse, torch.full_like(impulse, 20.0), rtol=0.12, atol=0.0)
     assert float((event.left > 10**6).float().mean()) == pytest.approx(0.5, abs=0.1)
+    env.close()
+
+
+def test_a_push_may_come_once_at_its_time(task: Imitation) -> None:
+    once = Pushes((80.0, 80.0), (inf, inf), 0.1, control_hz=30.0, first_s=0.2, direction="front")
+    worlds = pushed(task, once)
+    env = worlds.env(2, 1, False, threads=1, help_scale=0.0)
+    zero = torch.zeros(2, dtype=torch.long)
+    env.reset_to(zero, zero)
+    event, acted = env.event(Pushes), list[int]()
+    assert event is not None
+    for step in range(20):
+        if bool(event.acting[0]):
+            acted.append(step)
+        env.step(torch.zeros(2, env.num_actions))
+    assert acted == [6, 7, 8]
+    assert float(event.left.min()) > 10**6
+    # Copies that do not foresee it know of none that has not begun.
+    copies = pushed(task, replace(once, foreseen=False)).env(2, 1, False, threads=1, help_scale=0.0)
+    copies.reset_to(zero, zero)
+    blind = copies.event(Pushes)
+    assert blind is not None
+    for _ in range(10):
+        assert not bool(blind.acting.any())
+        copies.step(torch.zeros(2, copies.num_actions))
+    env.close()
+    copies.close()
+
+
+def test_a_push_from_the_front_goes_against_where_one_faces(task: Imitation) -> None:
+    given = Pushes((80.0, 80.0), (inf, inf), 0.5, first_s=0.1, direction="front")
+    env = pushed(task, given).env(1, 1, False, threads=1, help_scale=0.0)
+    zero = torch.zeros(1, dtype=torch.long)
+    env.reset_to(zero, zero)
+    event = env.event(Pushes)
+    assert event is not None
+    for _ in range(3):
+        env.step(torch.zeros(1, env.num_actions))
+    before = torch.tensor(from_the_front(env.goal.humanoid, env.backend.state.qpos[0]))
+    env.step(torch.zeros(1, env.num_actions))
+    torch.testing.assert_close(event.force[0].double(), 80.0 * before.double(), rtol=0, atol=1.0)
     env.close()
 
 

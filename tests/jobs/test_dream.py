@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+from poise.env.walk_path import WalkPath
 from poise.formats import read_clip
 from poise.jobs.endless import dreamt as frames
+from poise.jobs.endless.dream_world import DreamPush
 from poise.jobs.endless.dreaming import begun, dream, past_of
 from poise.jobs.endless.dreamt import NUMBER, ClipMaker, Dream, FrameStore, MotionWriter, Pieces
 from poise.jobs.endless.endless_training import Endless, motions_of, train_generator
@@ -22,6 +24,7 @@ from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.kinematics import hold_feet
+from poise.kinematics.supports import Support
 from poise.learn.cvae import CVAEConfig, CVAETraining
 from poise.motion import ClipLibrary, trim
 from poise.plan import LookaheadConfig
@@ -105,6 +108,46 @@ def test_two_characters_go_to_where_they_are_told(model: GeneratorModel, tracker
     assert made.reached[0][0] == 0 and made.reached[0][1] < 1.0
     assert [c.done.count for c in made.characters] == [30, 30]
     assert len(made.report().others) == 1 and "of 2 targets reached" in made.sentence
+
+
+@pytest.mark.parametrize("latent", [2, 9])
+def test_a_generator_of_any_z_goes_with_the_shipped_tracker(
+    tracker: Tracker, tmp_path: Path, latent: int
+) -> None:
+    net = CVAEConfig(past=8, future=9, latent=latent, hidden=16, layers=(16,))
+    motions = motions_of(ClipLibrary.of([walk()]), tracker, net, lambda _: None)
+    train_generator(motions, tmp_path, Endless(net, CVAETraining(batch=8), steps=4, ema=0.9))
+    made = dream(0.5, tmp_path, tracker, controller="policy", threads=1)
+    assert made.motion().frames == 15 and np.isfinite(made.motion().positions()).all()
+
+
+def test_two_share_a_world_with_a_box_and_are_pushed(model: GeneratorModel, tracker: Tracker) -> None:
+    chair = Support("seat", (0.5, 0.5, 0.45), (1.0, 0.0, 0.225))
+    high = Support("seat", (0.5, 0.5, 0.9), (4.0, 0.0, 0.45))
+    push = DreamPush(400.0, "chest", 0.2, 0.2, (0.0, 1.0, 0.0))
+    how = Dream(count=2, supports=(chair, high), lookahead=FEW, threads=1, seed=2)
+    made = dream(0.8, model, tracker, how)
+    hit = dream(0.8, model, tracker, how, pushes=(push, push))
+    assert "sat on; characters walk round it" in made.notes[0]
+    assert len(made.report().things) == 2 and made.to_dict()["visits"] == []
+    apart = hit.motion().root_pos[-1] - made.motion().root_pos[-1]
+    assert apart[1] > 0.1
+    np.testing.assert_allclose(hit.motion().root_pos[:5], made.motion().root_pos[:5], atol=1e-6)
+    with refused("bodies-overlap", says="seat 1"):
+        dream(0.5, model, tracker, supports=(replace(chair, pos=(0.3, 0.0, 0.225)),))
+    with refused("unknown-body-part", says="nose"):
+        dream(0.5, model, tracker, pushes=(DreamPush(at="nose"),))
+
+
+def test_a_path_is_followed_and_a_hand_helps(model: GeneratorModel, tracker: Tracker) -> None:
+    path = WalkPath(((0.0, 0.0), (3.0, 0.0)), 1.0)
+    made = dream(1.0, model, tracker, path=path, help_limit=80.0, controller="policy", threads=1, seed=3)
+    assert "up to 80 N of help" in made.sentence and any("Helped" in n for n in made.notes)
+    score = made.to_dict()
+    assert 0 < score["help"]["force_mean_n"] <= 80.0 and score["help"]["limit_n"] == 80.0
+    assert score["path"][0]["most_m"] < 1.0 and "m of the path" in made.sentence
+    with refused("option-conflict"):
+        Dream(path=path, targets=((1.0, 0.0),))
 
 
 def test_a_world_that_goes_bad_is_put_back(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 
 from poise.cli.console import INTERRUPTED, LOST, Answer, say, table
 from poise.cli.options import (
@@ -22,11 +22,13 @@ from poise.cli.options import (
     lookahead_of,
     places,
 )
+from poise.cli.push import direction_of
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
+    from poise.jobs.endless.dream_world import DreamPush
     from poise.jobs.endless.dreamt import Dreamt
 
 #: The most targets on a command line or in a file.
@@ -40,6 +42,11 @@ def run(
     temperature: Annotated[float, arg(metavar="T")] = 1.0,
     count: Annotated[int, arg(metavar="K")] = 1,
     steer: Annotated[str | None, arg(metavar="'X,Y X,Y'|FILE", help_behavior_hint="")] = None,
+    path: Annotated[str | None, arg(metavar="'X,Y X,Y'|FILE", help_behavior_hint="")] = None,
+    pace: Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")] = None,
+    scene: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
+    push: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="'WORD=VALUE ...'")] = (),
+    help_limit: Annotated[float, arg(metavar="NEWTONS")] = 0.0,
     style: Annotated[str | None, arg(metavar="LABEL", help_behavior_hint="")] = None,
     label_seconds: Annotated[float, arg(metavar="S")] = 10.0,
     loop: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None,
@@ -56,9 +63,9 @@ def run(
     json: Json = False,
     reading: OmitArgPrefixes[Reading] = Reading(),
 ) -> Answer:
-    """Let a simulated character go about without task, clip or help: a kinematic policy says what comes
-    next, from what it was doing, and a control policy does it. Write the motion, a .bvh as it is made,
-    score.json and report.html.
+    """Let a simulated character go about without task or clip, and without help unless some is allowed:
+    a kinematic policy says what comes next, from what it was doing, and a control policy does it. Write
+    the motion, a .bvh as it is made, score.json and report.html.
 
     Args:
         seconds: how long it goes about. Ctrl-C keeps what was done.
@@ -68,6 +75,15 @@ def run(
         count: characters in one world; they keep away from each other.
         steer: points to reach one after another, in m from where it begins, Z up; or a file with one on
             each line. After the last one it goes where it likes.
+        path: points of a path to walk along, as for --steer; one whose last point is its first is walked
+            round and round.
+        pace: speed along --path; by default whatever the character is at.
+        scene: boxes that stand in the world (.json), as --support of poise track takes them; characters
+            walk round them, and sit down on a seat now and then.
+        push: a push on each character, in the words of poise push, such as 'at=chest force=200 from=5
+            seconds=0.2 direction=0,1,0'. every=10, or every=5-15, pushes again after so many s;
+            direction=any draws a direction each time. May be given several times.
+        help_limit: a hand that no real person has leads the root with up to so many N and N m.
         style: only motion of this label, where the generator's library has labels, such as dance.
         label_seconds: it keeps to motion of one label of the library for about so long, and then turns
             to another one; 0 leaves that to chance. Neither with --style nor on the way to points.
@@ -99,18 +115,29 @@ def run(
     folder, motion = places(out)
     read = () if seed_clip is None else (seed_clip,)
     may_deliver(folder, motion, force, *read)
-    targets = () if steer is None else targets_of(steer)
+    check_range("help-limit", help_limit, 0, 100_000)
+    targets = () if steer is None else points_of(steer, "--steer")
+    if pace is not None and path is None:
+        raise PoiseError(
+            "--pace is the speed along a --path", hint="Give a path", code="option-needs-option"
+        )
+    from poise.env.walk_path import WalkPath
     from poise.formats import write_clip
     from poise.jobs.endless.dreaming import dream, names_of
     from poise.jobs.endless.dreamt import Dream
     from poise.jobs.endless.model import load_generator
     from poise.jobs.open import open_run
+    from poise.kinematics.supports import read_supports
 
     ahead = lookahead_of(budget)
     config = Dream(
         temperature=temperature,
         count=count,
         targets=targets,
+        path=None if path is None else WalkPath(points_of(path, "--path"), pace),
+        supports=() if scene is None else read_supports(scene),
+        pushes=tuple(push_of(text) for text in push),
+        help_limit=help_limit,
         seed=seed,
         controller=controller,
         lookahead=ahead,
@@ -158,13 +185,13 @@ def run(
     return Answer(result, {**named, **paths}, tuple(notes), code, word)
 
 
-def targets_of(text: str) -> tuple[tuple[float, float], ...]:
-    """Points as `5,0 5,5`, or from a file with one on each line.
+def points_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
+    """Points as `5,0 5,5`, or from a file with one on each line; `where` is the option.
 
     Raises:
         PoiseError: something else, naming it.
     """
-    path, where = Path(text), "--steer"
+    path = Path(text)
     if path.is_file():
         where = str(path)
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -187,6 +214,45 @@ def targets_of(text: str) -> tuple[tuple[float, float], ...]:
             f"there must be 1 to {MOST_TARGETS:,} points, got {len(out)}", where, code="out-of-range"
         )
     return tuple(out)
+
+
+def push_of(text: str) -> DreamPush:
+    """A push in words: `at=chest force=200 from=5 seconds=0.2 direction=0,1,0 every=5-15`.
+
+    Raises:
+        PoiseError: another word, or a value that makes no sense.
+    """
+    from poise.jobs.endless.dream_world import DreamPush
+
+    names = {"force": "newtons", "at": "at", "from": "start_s", "seconds": "seconds",
+             "direction": "direction", "every": "every_s"}  # fmt: skip
+    values = dict[str, Any]()
+    for part in text.split():
+        word, equals, value = part.partition("=")
+        if word not in names or not equals or not value:
+            raise PoiseError(
+                f"'{part[:40]}' makes no push",
+                "--push",
+                f"Write WORD=VALUE with {', '.join(names)}, such as force=200",
+                code="option-malformed",
+            )
+        if word == "at" or value in ("any", "front"):
+            values[names[word]] = value
+            continue
+        try:
+            if word == "direction":
+                values["direction"] = direction_of(value)
+            elif word == "every":
+                low, _, high = value.partition("-")
+                values["every_s"] = float(low), float(high or low)
+            else:
+                values[names[word]] = float(value)
+        except (ValueError, PoiseError):
+            raise PoiseError(
+                f"'{part[:40]}' has no number", "--push",
+                "Write for example force=200, every=5-15 or direction=0,1,0", code="option-malformed",
+            ) from None  # fmt: skip
+    return DreamPush(**values)
 
 
 def _say(done: Dreamt) -> None:

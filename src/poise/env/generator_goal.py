@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Protocol
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.stream_goal import BufferedGoal
+from poise.env.walk_path import FAR, WalkPath
 from poise.errors import PoiseError
 from poise.settings import Checked, Range
 
@@ -39,49 +41,91 @@ class MotionGenerator(Protocol):
 
 #: Distance (m) at which a target is reached.
 REACHED = 0.5
-#: Most distance (m) of a target from the one before it.
-FAR = 10_000.0
-#: Distance (m) that characters are to keep, with what a simulation is off; cost of a metre too near.
-APART, NEAR_COST = 0.7, 100.0
-#: Futures that are proposed where one is chosen: to get somewhere, and to keep apart alone.
-PROPOSALS, FEW = 240, 24
+#: Distance (m) that characters are to keep, with what a simulation is off and a fall takes; cost of a
+#: metre too near; distance (m) within which others are in the way; s whose speed goes on unseen.
+APART, NEAR_COST, IN_THE_WAY, GOES_S = 1.1, 100.0, 3.0, 0.3
+#: m about a box that stands in the way in which no root is to be.
+CLEAR = 0.35
+#: Costs of a m from the path on average and at most, and of a m by which the way along it is too short.
+OFF_COST, FARTHEST_COST, LATE_COST = 2.0, 1.0, 0.5
+#: m/s at which a path is to be followed at least, where no speed is wished for; rad/s and m/s with which
+#: what walks turns along it.
+GOES_ON, BEND, WALKS = 1.1, 1.0, 0.8
+#: Futures that are proposed where one is chosen: to get somewhere, on a path or where others are in the
+#: way, and to keep apart alone.
+PROPOSALS, SOME, FEW = 240, 96, 24
+
+
+@dataclass(frozen=True)
+class Footprint(Checked):
+    """A box on the floor, seen from above, that characters walk round.
+
+    Attributes:
+        pos: m, its middle. size: m, its extents along its own axes. yaw: rad, its turn about Z.
+    """
+
+    pos: tuple[float, float]
+    size: tuple[float, float]
+    yaw: float = 0.0
+
+    def seen(self, places: Tensor) -> Tensor:
+        """Places `(..., 2)` m of the world in its own frame."""
+        out, c, s = places - torch.tensor(self.pos).to(places), math.cos(self.yaw), math.sin(self.yaw)
+        return torch.stack((c * out[..., 0] + s * out[..., 1], c * out[..., 1] - s * out[..., 0]), -1)
+
+    def depth(self, places: Tensor, margin: float = 0.0) -> Tensor:
+        """`(...)` m by which places `(..., 2)` lie in it, with a margin about it; 0 outside."""
+        half = 0.5 * torch.tensor(self.size).to(places) + margin
+        return (half - self.seen(places).abs()).amin(-1).clamp_min(0.0)
 
 
 @dataclass(frozen=True)
 class Steering(Checked):
-    """Targets one after another, and distance from each other.
+    """Targets one after another or a path, and distance from each other and from what stands there.
 
     Attributes:
         targets: x and y in m, in the order in which they are to be reached; after the last one
             characters go where they like.
         apart: whether characters of one world keep away from each other.
+        path: that is followed from its first point on, in place of targets; None for none.
+        boxes: that are walked round.
+        leads: whether worlds may be led somewhere else for a while, see `GeneratorGoal.led`.
     """
 
     targets: Annotated[tuple[tuple[float, float], ...], Range(-FAR, FAR, unit="m")] = ()
     apart: bool = False
+    path: WalkPath | None = None
+    boxes: tuple[Footprint, ...] = ()
+    leads: bool = False
+
+    @property
+    def goes(self) -> bool:
+        """Whether there is somewhere to go."""
+        return bool(self.targets) or self.path is not None or self.leads
 
     @property
     def chooses(self) -> bool:
         """Whether one of several futures is to be chosen at all."""
-        return bool(self.targets) or self.apart
-
-    @property
-    def proposals(self) -> int:
-        """How many futures one is chosen from."""
-        return PROPOSALS if self.targets else FEW
+        return self.goes or self.apart or bool(self.boxes)
 
     def target(self, reached: int) -> Tensor | None:
         """The next one `(2)` m after so many; None after the last."""
         return torch.tensor(self.targets[reached]).double() if reached < len(self.targets) else None
 
 
-def cost_of(futures: Tensor, target: Tensor | None, others: Sequence[Tensor]) -> Tensor:
+def cost_of(
+    futures: Tensor,
+    target: Tensor | None,
+    others: Sequence[Tensor],
+    boxes: Sequence[Footprint] = (),
+) -> Tensor:
     """What futures cost, `(K)`.
 
     Args:
         futures: `(K, f, 2)` m, where the root goes in each.
         target: `(2)` m; None for none.
         others: `(f, 2)` m, where each of the other characters goes meanwhile.
+        boxes: that stand in the way.
     """
     cost = torch.zeros(len(futures)).to(futures)
     if target is not None:
@@ -89,9 +133,24 @@ def cost_of(futures: Tensor, target: Tensor | None, others: Sequence[Tensor]) ->
         # Halfway counts as well, so that it does not go round about.
         cost = torch.minimum(0.5 * (off[:, -1] + off[:, off.shape[1] // 2]), off.amin(-1) + REACHED)
     for other in others:
-        near = (APART - (futures - other).norm(dim=-1)).clamp_min(0.0)
-        cost = cost + NEAR_COST * near.square().mean(-1)
+        near = (APART - (futures - other).norm(dim=-1)).clamp_min(0.0).square()
+        # The nearest moment counts by itself: who brushes by hits, too.
+        cost = cost + NEAR_COST * (near.mean(-1) + 0.5 * near.amax(-1))
+    for box in boxes:
+        cost = cost + NEAR_COST * box.depth(futures, CLEAR).square().mean(-1)
     return cost
+
+
+def path_cost(path: WalkPath, along: Tensor, off: Tensor, first: float, fps: float) -> Tensor:
+    """What futures cost that go along a path, `(K)`.
+
+    Args:
+        along, off: `(K, f)` m along it and from it, see `WalkPath.bent`. first: m, where they begin.
+    """
+    seconds = along.shape[1] / fps
+    late = (path.speed or GOES_ON) * seconds - (along[:, -1] - first)
+    late = late.clamp_min(0.0) if path.speed is None else late.abs()
+    return OFF_COST * off.mean(1) + FARTHEST_COST * off.amax(1) + LATE_COST * late
 
 
 class GeneratorGoal(BufferedGoal):
@@ -112,6 +171,9 @@ class GeneratorGoal(BufferedGoal):
         waits: `(N,)` bool, worlds for which nothing is made, see `env.recovery.recovering`.
         steps: `(N,)` control steps that were made.
         reached: (world, control step) of every target that was.
+        led: x and y in m to which a world is led, before all targets, while it is told here.
+        strayed: `(N, 4)` of worlds that have come to the path: control steps on it, those of them more
+            than `REACHED` m from it, the sum and the most of their distances, m.
     """
 
     watches = True
@@ -143,10 +205,17 @@ class GeneratorGoal(BufferedGoal):
         # Frames of each segment that are done before more is made: the way to a target is thought over
         # after half of one.
         half = -(-generator.future // 2)
-        self.keeps = half if self.steering.targets else generator.future
+        self.keeps = half if self.steering.goes or self.steering.apart else generator.future
         self.waits = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self.steps = torch.zeros_like(self.at)
         self.reached, self._passed = list[tuple[int, int]](), torch.zeros_like(self.at)
+        self.led = dict[int, Tensor]()
+        self.strayed = torch.zeros(num_envs, 4, dtype=torch.float64, device=self.device)
+        # m along the path of the roots, of the last frames that are known, and where the roots are.
+        self._along = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
+        self._known_along = torch.zeros_like(self._along)
+        self._done = torch.zeros_like(self.waits)
+        self._root = torch.zeros(num_envs, 2, dtype=torch.float64, device=self.device)
         # What characters did in the last frames, the last one now; how many of them are known.
         self._did = self.qpos[:, : generator.past].clone()
         self._known = torch.zeros_like(self.at)
@@ -174,6 +243,7 @@ class GeneratorGoal(BufferedGoal):
         self.clear(ids)
         self.extend(ids, frames)
         self.at[ids], self._known[ids] = 0, 0
+        self._known_along[ids] = self._along[ids]
 
     # --- frames -------------------------------------------------------------------------------
 
@@ -212,19 +282,68 @@ class GeneratorGoal(BufferedGoal):
         propose = getattr(self.generator, "propose", None)
         if propose is None or not self.steering.chooses:
             return self.generator.generate(past, ids, self.rng)
-        futures, out = propose(past, self.rng, self.steering.proposals, ids), list[Tensor]()
-        steps = torch.arange(1, self.generator.future + 1, device=self.device)
-        for world, made in zip(ids.tolist(), futures, strict=True):
-            others = list[Tensor]()
-            for other in range(self.num_envs if self.steering.apart else 0):
-                if other != world:
-                    # The same moments of the other's motion, as far as they are known.
-                    ahead = int(self.count[world] - 1 - self.at[world])
-                    index = (self.at[other] + ahead + steps).clamp_max(int(self.count[other]) - 1)
-                    others.append(self.qpos[other, index % self.size, :2])
-            target = self.steering.target(int(self._passed[world]))
-            out.append(made[int(cost_of(made[..., :2], target, others).argmin())])
+        out = list[Tensor]()
+        for row, world in enumerate(ids.tolist()):
+            one, last, target = slice(row, row + 1), past[row, -1].double(), self._target(world)
+            path, begun = self._path(world, last)
+            goes = target is not None or path is not None
+            # Where there is somewhere to go, that alone counts, not what the world wishes.
+            wishes = None if goes else ids[one]
+            others, boxes = self._others(world), self.steering.boxes
+            crowded = any(float((o - last[:2]).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
+            count = PROPOSALS if target is not None else SOME if goes or crowded else FEW
+            made = propose(past[one], self.rng, count, wishes)[0]
+            cost = torch.zeros(len(made)).to(made)
+            along = None
+            if path is not None:
+                made, along, off = path.bent(made, last, begun, self.rate_hz, BEND, WALKS)
+                cost = path_cost(path, along, off, begun, self.rate_hz)
+            best = int((cost + cost_of(made[..., :2], target, others, boxes)).argmin())
+            if along is not None:
+                self._known_along[world] = along[best, self.keeps - 1]
+            out.append(made[best])
         return torch.stack(out)
+
+    def is_free(self, world: int) -> bool:
+        """Whether a world has no target left and is on no path."""
+        path = self.steering.path
+        there = path is None or bool(self._done[world])
+        return there and self.steering.target(int(self._passed[world])) is None
+
+    def _target(self, world: int) -> Tensor | None:
+        """Where a world is to go next, `(2)` m; None for no place in particular."""
+        led = self.led.get(world)
+        return self.steering.target(int(self._passed[world])) if led is None else led
+
+    def _path(self, world: int, last: Tensor) -> tuple[WalkPath | None, float]:
+        """The path that a world follows after its last frame `(7 + n)`, and how far along it that is,
+        m."""
+        path = self.steering.path
+        if path is None or world in self.led:
+            return None, 0.0
+        begun = float(path.nearest(last[None, :2], self._known_along[world : world + 1])[0])
+        return (None if path.over(begun) else path), begun
+
+    def _others(self, world: int) -> list[Tensor]:
+        """`(f, 2)` m, where each other character is in the frames that are made for a world."""
+        steps = torch.arange(1, self.generator.future + 1, device=self.device)
+        out = list[Tensor]()
+        for other in range(self.num_envs if self.steering.apart else 0):
+            if other == world:
+                continue
+            if self.waits[other]:
+                # It lies, gets up or sits, wherever its motion would be.
+                out.append(self._root[other].expand(len(steps), 2))
+                continue
+            # The same moments of the other's motion; beyond what is known it goes on as it goes.
+            ahead = int(self.count[world] - 1 - self.at[world])
+            index, last = self.at[other] + ahead + steps, int(self.count[other]) - 1
+            before = max(0, last - round(GOES_S * self.rate_hz))
+            goes = self.qpos[other, last % self.size, :2] - self.qpos[other, before % self.size, :2]
+            beyond = (index - last).clamp_min(0) / max(1, last - before)
+            known = self.qpos[other, index.clamp_max(last) % self.size, :2]
+            out.append(known + beyond[:, None] * goes)
+        return out
 
     def _past(self, past: Tensor, ids: Tensor) -> Tensor:
         """Pasts `(n, p, 7 + n)` in which what was done stands as far as it is known; frames that are yet
@@ -247,6 +366,9 @@ class GeneratorGoal(BufferedGoal):
             good = ~self.waits & qpos.isfinite().all(-1)
             self._did = torch.cat((self._did[:, 1:], qpos[:, None].to(self._did)), 1)
             self._known = torch.where(good, (self._known + 1).clamp_max(self._did.shape[1]), 0)
+        self._root = qpos[:, :2].double().clone()
+        if self.steering.path is not None:
+            self._stray(self.steering.path)
         for i in range(self.num_envs if self.steering.targets else 0):
             target = self.steering.target(int(self._passed[i]))
             if target is not None and float((qpos[i, :2].double().cpu() - target).norm()) <= REACHED:
@@ -254,10 +376,23 @@ class GeneratorGoal(BufferedGoal):
                 self.reached.append((i, int(self.steps[i])))
         return False
 
+    def _stray(self, path: WalkPath) -> None:
+        """Notes how far along the path and how far from it characters are."""
+        self._along, off = path.nearest(self._root.cpu(), self._along)
+        self._done |= torch.tensor([path.over(float(s)) for s in self._along])
+        come = ~self._done & ((self.strayed[:, 0] > 0) | (off <= REACHED))
+        self.strayed[come, 0] += 1
+        self.strayed[come, 1] += (off > REACHED).double()[come]
+        self.strayed[come, 2] += off[come]
+        self.strayed[come, 3] = torch.maximum(self.strayed[:, 3], off)[come]
+
     def where(self, env: int) -> str:
         return f"endless motion, control step {int(self.steps[env])}"
 
     def rows(self) -> dict[str, Tensor]:
-        own = {"passed": self._passed, "did": self._did, "known": self._known, "steps": self.steps}
+        own = {
+            "passed": self._passed, "did": self._did, "known": self._known, "steps": self.steps,
+            "along": self._along, "known_along": self._known_along, "root": self._root,
+        }  # fmt: skip
         generator = {f"generator/{k}": v for k, v in self.generator.rows().items()}
         return {**super().rows(), **generator, **own}

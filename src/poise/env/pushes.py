@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.env.events import EpisodeStart, Felt, Force, StatedEvent
 from poise.env.goal import Goal
 from poise.errors import PoiseError
+from poise.motion.rotations import quat_rotate
 from poise.settings import Checked, Count, Length, Positive, Range, Share
 from poise.sim import Backend, Drive
 
@@ -97,23 +98,33 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
 
     Attributes:
         newtons: between which the force is drawn, N.
-        every_s: between which the time from one push's end to the next one's begin is drawn, s.
+        every_s: between which the time from one push's end to the next one's begin is drawn, s; infinity
+            for none after the first one.
         lasts_s: how long each lasts, s; two: between which that is drawn, evenly in its logarithm.
         share: of the episodes that have pushes.
         impulse_ns: N s that none has more of; long pushes are as much weaker.
         bodies: rows of the body table of which one is pushed at its inertial centre.
         control_hz: control steps per second.
         seed: of the draws.
+        first_s: s of the episode in which the first one begins; None draws it as the later ones.
+        direction: where they push to, in world axes, of any length; "front" pushes each character
+            against where it faces when the push begins, "any" to a horizontal direction that is drawn.
+        foreseen: whether pushes begin in this environment by themselves, see `Push.foreseen`.
+        name: of its rows, where a task has several of them.
     """
 
     newtons: Annotated[tuple[float, float], Range(0, rising=True, unit="N")] = (50.0, 200.0)
-    every_s: Annotated[tuple[float, float], Range(0, rising=True, unit="s")] = (1.0, 3.0)
+    every_s: Annotated[tuple[float, float], Range(0, rising=True, infinite=True, unit="s")] = (1.0, 3.0)
     lasts_s: Annotated[float | tuple[float, float], Range(0, above=True, rising=True, unit="s")] = 0.2
     bodies: Annotated[tuple[int, ...], Length(1)] = (0,)
     control_hz: Positive = 30.0
     seed: int = 0
     share: Share = 1.0
     impulse_ns: Annotated[float, Range(0, above=True, infinite=True)] = float("inf")
+    first_s: Annotated[float | None, Range(0, unit="s")] = None
+    direction: tuple[float, float, float] | Literal["front", "any"] = "any"
+    foreseen: bool = True
+    name: str = "push"
 
     @property
     def lasting(self) -> tuple[float, float]:
@@ -123,13 +134,13 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
 
     def enter(self, goal: Goal, backend: Backend) -> None:
         n, here = backend.num_envs, backend.device
-        self._backend = backend
+        self._backend, self._to_left = backend, torch.tensor(goal.humanoid.left, device=here).double()
         self._rng = torch.Generator().manual_seed(self.seed)
         self.left = torch.zeros(n, dtype=torch.long, device=here)
         self.lasts = torch.zeros_like(self.left)
         self.body = torch.zeros(n, dtype=torch.long, device=here)
         self.force = torch.zeros(n, 3, dtype=backend.drive.xfrc_applied.dtype, device=here)
-        self._draw(torch.arange(n, device=here))
+        self._draw(torch.arange(n, device=here), self.first_s)
 
     @property
     def acting(self) -> Tensor:
@@ -139,13 +150,15 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
     def begin(self, episodes: EpisodeStart) -> None:
         """Episodes begin with a time without a push; some have none at all."""
         rows = torch.arange(len(self.left), device=self.left.device)[episodes.rows]
-        self._draw(rows)
+        self._draw(rows, self.first_s)
         if self.share < 1.0:
             none = torch.rand(len(rows), generator=self._rng) >= self.share
             self.left[rows[none.to(rows.device)]] = NEVER
 
     def before_step(self, drive: Drive) -> bool:
         """Adds the force of each push."""
+        if self.direction == "front" and bool((begins := self.left == 0).any()):
+            self.force[begins] = self._against(begins)
         rows = self.acting.nonzero().squeeze(-1)
         drive.xfrc_applied[rows, self.body[rows], :3] += self.force[rows]
         return False
@@ -158,32 +171,39 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
 
     def after_step(self) -> None:
         """Counts down, and draws the next push where one is over."""
-        self.left -= 1
-        self._draw((self.left <= -self.lasts).nonzero().squeeze(-1))
+        self.left -= 1 if self.foreseen else self.acting.long()
+        over = (self.left <= -self.lasts).nonzero().squeeze(-1)
+        if self.foreseen:
+            self._draw(over)
+        else:
+            self.left[over] = NEVER
 
     def rows(self) -> dict[str, Tensor]:
         return {
-            "push/left": self.left,
-            "push/lasts": self.lasts,
-            "push/body": self.body,
-            "push/force": self.force,
+            f"{self.name}/left": self.left,
+            f"{self.name}/lasts": self.lasts,
+            f"{self.name}/body": self.body,
+            f"{self.name}/force": self.force,
         }
 
     def state(self) -> dict[str, Tensor]:
         """The pushes, and the generator of those to come."""
-        return {**super().state(), "push/rng": self._rng.get_state()}
+        return {**super().state(), f"{self.name}/rng": self._rng.get_state()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on with the same pushes; from a task without pushes with those it has."""
-        if "push/rng" in state:
+        if f"{self.name}/rng" in state:
             super().load_state(state)
-            self._rng.set_state(state["push/rng"])
+            self._rng.set_state(state[f"{self.name}/rng"])
 
-    def _draw(self, ids: Tensor) -> None:
+    def _draw(self, ids: Tensor, first_s: float | None = None) -> None:
+        """The next pushes on characters `ids (n,)`, after `first_s` where that is told."""
         n = len(ids)
         unit = torch.rand(3, n, generator=self._rng)
         pick = torch.randint(len(self.bodies), (n,), generator=self._rng)
-        wait = self.every_s[0] + (self.every_s[1] - self.every_s[0]) * unit[0]
+        soonest, latest = self.every_s if first_s is None else (first_s, first_s)
+        # Infinity less infinity is no number.
+        wait = torch.full((n,), soonest) if soonest == latest else soonest + (latest - soonest) * unit[0]
         size = self.newtons[0] + (self.newtons[1] - self.newtons[0]) * unit[1]
         angle = 2 * torch.pi * unit[2]
         low, high = self.lasting
@@ -192,7 +212,21 @@ class Pushes(StatedEvent[Goal, Backend], Force, Checked):
             lasts = low * (high / low) ** torch.rand(n, generator=self._rng)
         size = size.clamp_max(self.impulse_ns / lasts)
         force = torch.stack((size * angle.cos(), size * angle.sin(), 0 * size), 1)
-        self.left[ids] = (wait * self.control_hz).round().long().clamp_min(1).to(self.left.device)
+        if isinstance(self.direction, tuple):
+            way = torch.tensor(self.direction)
+            force = size.unsqueeze(1) * way / way.square().sum().sqrt()
+        steps = (wait * self.control_hz).round().clamp(1, NEVER)
+        self.left[ids] = steps.long().to(self.left.device)
         self.lasts[ids] = (lasts * self.control_hz).round().long().clamp_min(1).to(self.left.device)
         self.force[ids] = force.to(self.force)
         self.body[ids] = (torch.tensor(self.bodies)[pick] + 1).to(self.body.device)
+
+    def _against(self, rows: Tensor) -> Tensor:
+        """`(n, 3)` N, the forces on characters `rows (N,)` bool against where they face."""
+        quat = self._backend.state.qpos[rows, 3:7].double()
+        left = quat_rotate(quat, self._to_left.expand(len(quat), 3))
+        # Forward is left x up.
+        back = torch.stack((-left[:, 1], left[:, 0], torch.zeros_like(left[:, 0])), 1)
+        size = back.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-6)
+        newtons = self.force[rows].square().sum(-1, keepdim=True).sqrt()
+        return (back / size * newtons).to(self.force)

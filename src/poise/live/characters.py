@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.env.generator_goal import IN_THE_WAY, SOME, cost_of
 from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.env.recovery.planner import way_to_stand
 from poise.env.recovery.recovering import RecoveryPhases
@@ -154,12 +156,15 @@ class EndlessCoords:
         self._last: np.ndarray | None = None
         self._where = Offset()
 
-    def next(self, waits: bool = False) -> np.ndarray | None:
+    def next(self, waits: bool = False, others: Sequence[np.ndarray] = ()) -> np.ndarray | None:
         """The next frame `(7 + n)`; None before any was made.
 
-        waits: the character has lost it, and it waits for it.
+        Args:
+            waits: the character has lost it, and it waits for it.
+            others: `(m, 3)` m each, where the roots of other characters are in the next frames, as far
+                as that is known; it keeps away from them.
         """
-        self._more()
+        self._more(others)
         if self._frames and not (waits and self._last is not None):
             self._last = self._frames.popleft()
         return None if self._last is None else self._where(self._last)
@@ -168,20 +173,43 @@ class EndlessCoords:
         """Lets it go on so that the coordinates `seen (7 + n)` are where and face as `to` does."""
         self._where.move(seen, to)
 
-    def _more(self) -> None:
+    def coming(self) -> np.ndarray:
+        """`(m, 3)` m, where its root is in the next frames, as far as they are made."""
+        frames = [f for f in (self._last, *self._frames) if f is not None]
+        return self._where.points(np.array([f[:3] for f in frames]).reshape(-1, 3))
+
+    def _more(self, others: Sequence[np.ndarray]) -> None:
         if self._made is not None and self._made.done():
             made, self._made = self._made.result(), None
             self._past = torch.cat((self._past, made), 1)[:, -self._generator.past :]
             self._frames.extend(made[0].numpy())
         if self._made is None and len(self._frames) < AHEAD:
+            there = [self._there(places) for places in others if len(places)]
             if self._executor is not None:
-                self._made = self._executor.submit(self._make)
+                self._made = self._executor.submit(self._make, there)
             else:
                 self._made = Future()
-                self._made.set_result(self._make())
+                self._made.set_result(self._make(there))
 
-    def _make(self) -> Tensor:
-        return self._generator.generate(self._past, torch.zeros(1, dtype=torch.long), self._rng)
+    def _there(self, places: np.ndarray) -> Tensor:
+        """`(f, 2)` m, where another one is in the frames that are to be made, in the generator's world;
+        beyond what is known it goes on as it goes."""
+        index = len(self._frames) + np.arange(1, self._generator.future + 1)
+        last = len(places) - 1
+        before = max(0, last - AHEAD // 3)
+        step = (places[last] - places[before]) / max(1, last - before)
+        found = places[np.minimum(index, last)] + np.maximum(index - last, 0)[:, None] * step
+        return torch.from_numpy(self._where.back(found)[:, :2].copy())
+
+    def _make(self, others: Sequence[Tensor]) -> Tensor:
+        one = torch.zeros(1, dtype=torch.long)
+        here = self._past[0, -1, :2]
+        if not any(float((o - here).norm(dim=-1).amin()) < IN_THE_WAY for o in others):
+            return self._generator.generate(self._past, one, self._rng)
+        made = self._generator.propose(self._past, self._rng, SOME, one)[0]
+        best = int(cost_of(made[..., :2], None, others).argmin())
+        # The others may turn meanwhile: half of it is done before more is made.
+        return made[None, best, : -(-self._generator.future // 2)]
 
 
 #: What a character does.

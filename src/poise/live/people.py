@@ -51,6 +51,10 @@ class Offset:
         """Points `(..., 3)` m there."""
         return quat_rotate(yaw_quat(self.yaw), places) + self.shift
 
+    def back(self, places: np.ndarray) -> np.ndarray:
+        """Points `(..., 3)` m from there to where the source has them."""
+        return quat_rotate(yaw_quat(-self.yaw), places - self.shift)
+
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
         """Lets the motion go on so that the coordinates `seen (7 + n)` are where and face as `to
         (7 + n)` does; heights stay."""

@@ -100,7 +100,7 @@ class Targets:
             self._was[k] = follows
             character.blend()
         if endless is not None:
-            made = endless.next(character.doing in (FALLS, RETURNS))
+            made = endless.next(character.doing in (FALLS, RETURNS), self._others(k))
             qpos = None if made is None else tensor(self._noisy(k, made)[0])
         elif person is not None and person.ready() and person.onto is not None:
             pose = person.read(now_s + 1.0 / world.rate_hz)
@@ -123,6 +123,17 @@ class Targets:
             elif person is not None and person.onto is not None:
                 person.onto.where.move(seen, to)
         return (frame, places, own) if frame is qpos else (frame, None, None)
+
+    def _others(self, k: int) -> list[np.ndarray]:
+        """`(m, 3)` m each, where other characters than k are in the next frames."""
+        out = list[np.ndarray]()
+        for j, character in enumerate(self.world.characters):
+            endless = self.endless.get(j)
+            if j != k and endless is not None and character.doing not in (FALLS, RETURNS):
+                out.append(endless.coming())
+            elif j != k:
+                out.append(self.world.body(j).qpos[None, :3].numpy())
+        return out
 
     def _noisy(
         self, k: int, qpos: np.ndarray, places: np.ndarray | None = None

@@ -11,11 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.control import ExplicitResidual
+from poise.control import ExplicitResidual, Residual
+from poise.env.frame import Pose
+from poise.env.goal import Goal
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.motion.rotations import GRAVITY, heading_quat, quat_rotate_inv
 from poise.plan.guide import Guide, Spring
+from poise.sim import SimState
 
 if TYPE_CHECKING:
     from poise.env.env import ImitationEnv
@@ -343,6 +346,50 @@ def make_plan(reference: Reference, config: ExpertConfig | None = None) -> Plan:
             rows_.append(torch.tensor(np.concatenate((value, value[-1:]))).float())
     force_h = quat_rotate_inv(heading_quat(reference.qpos[:, 3:7].float()), torch.cat(force))
     return Plan(torch.cat(torque), force_h, torch.cat(turn), torch.cat(lift), tuple(parts))
+
+
+#: Steps of motions whose inverse dynamics is remembered: copies of a world ask for the same ones.
+REMEMBERED = 512
+
+
+class GoalGuide(Guide):
+    """A hand (`Guide`) along goals that are no clips, such as a generator's: inverse dynamics of each
+    step is solved as the goal tells it, from its frame now and the next one.
+
+    Args:
+        reference: any motion of the body. residual: see `Guide`.
+    """
+
+    def __init__(self, reference: Reference, residual: Residual):
+        none = torch.zeros(0, 3)
+        super().__init__(reference, residual, none, none)
+        self._model, self._solved = reference.humanoid.model, dict[bytes, tuple[Tensor, Tensor]]()
+
+    def __call__(self, state: SimState, goal: Goal) -> Tensor:
+        """Residual actions `(N, dims)` for the worlds as they stand."""
+        now, ahead = (goal.layout.unpacked(x) for x in (goal.now(), goal.ahead()))
+        found = [self._step(now, ahead, i, goal.rate_hz) for i in range(len(now.qpos))]
+        force, torque = (torch.stack(x) for x in zip(*found, strict=True))
+        self.force_h, self.torque_b = force.to(now.qpos), torque.to(now.qpos)
+        rows = torch.arange(len(found), device=now.qpos.device)
+        return self.action(state.qpos, state.qvel, now, rows)
+
+    def _step(self, now: Pose, ahead: Pose, i: int, rate_hz: float) -> tuple[Tensor, Tensor]:
+        """Force in the root's heading and torque in its axes, `(3)` N and N m, that a step needs."""
+        qpos, qvel = (
+            torch.stack((a[i], b[i])).double().cpu().numpy()
+            for a, b in ((now.qpos, ahead.qpos), (now.qvel, ahead.qvel))
+        )
+        key = qpos.tobytes() + qvel.tobytes()
+        if key not in self._solved:
+            if len(self._solved) >= REMEMBERED:
+                self._solved.pop(next(iter(self._solved)))
+            steps = step_midpoints(self._model, qpos, qvel, rate_hz)
+            part = inverse_dynamics(self._model, *steps)
+            turn = heading_quat(torch.tensor(qpos[:1, 3:7]))
+            force = quat_rotate_inv(turn, torch.tensor(part.root_force))[0]
+            self._solved[key] = force.float(), torch.tensor(part.root_torque[0]).float()
+        return self._solved[key]
 
 
 class Expert:

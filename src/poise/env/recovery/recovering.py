@@ -18,6 +18,7 @@ from poise.env.generator_goal import GeneratorGoal
 from poise.env.goal import ClipGoal, Goal
 from poise.env.recovery.get_up import GetUpPlanner, RecoveryClips
 from poise.env.recovery.planner import entry, way_into, way_to_stand
+from poise.env.recovery.seats import Seats
 from poise.env.reference import Reference, Start
 from poise.metrics import has_lost
 
@@ -109,6 +110,8 @@ class Recovering(Goal):
         returns: whether a clip that is lost is come back to; without, it goes on to its end.
         plans: whether recovery motions are planned here; a copy of such a world, in which a controller
             tries something for some steps, does without.
+        seats: where worlds that follow a generator sit down now and then; their planned motion is one
+            like a recovery motion.
 
     Attributes:
         doing: `(N,)`, `TRACKS`, `FALLS` or `RETURNS`.
@@ -127,7 +130,9 @@ class Recovering(Goal):
         chained: bool = False,
         returns: bool = True,
         plans: bool = True,
+        seats: Seats | None = None,
     ):
+        self.seats = seats if plans else None
         self.goal, self.chained, self.returns, self.plans = goal, chained, returns, plans
         self.humanoid, self.bodies, self.rate_hz = goal.humanoid, goal.bodies, goal.rate_hz
         self.layout, self.local = goal.layout, goal.local
@@ -159,6 +164,17 @@ class Recovering(Goal):
     def reached(self) -> list[tuple[int, int]]:
         """See `GeneratorGoal.reached`."""
         return self.goal.reached if isinstance(self.goal, GeneratorGoal) else []
+
+    def strayed(self, rate_hz: float) -> tuple[tuple[float, float, float, float], ...]:
+        """Of each world that came to the path of its generator: s on it, the share of them more than
+        `REACHED` m from it, the mean and the greatest distance, m."""
+        if not isinstance(self.goal, GeneratorGoal):
+            return ()
+        return tuple(
+            (n / rate_hz, far / n, off / n, most)
+            for n, far, off, most in self.goal.strayed.tolist()
+            if n
+        )
 
     # --- episodes -----------------------------------------------------------------------------
 
@@ -235,15 +251,18 @@ class Recovering(Goal):
         ends = self.at >= self._length - self._tail
         change = self._phases.watch(off & (~tracked | self.returns), speed, lies, ends)
         lost, back = change.lost, change.back
+        sits = self._sits()
         if self.plans:
-            self.lost += self._noted(lost & tracked)
-            self.back += self._noted(back)
+            self.lost += self._noted(lost & (tracked | sits))
+            self.back += self._noted(back & ~sits)
         self._on[back] = False
         if isinstance(self.goal, GeneratorGoal) and bool(back.any()):
             ids = back.nonzero().squeeze(-1)
             stands = self._qpos[self._first[ids] + self._length[ids] - 1]
             self.goal.begin_from(ids, stands.unsqueeze(1).expand(-1, self._tail, -1))
         over = rests = change.rests & (self.plans and self.get_up is not None)
+        if self.seats is not None and isinstance(self.goal, GeneratorGoal):
+            rests = rests | self._visit(self.seats, self.goal, lost & sits, back & sits, qpos)
         if self.chained:
             over, away = self._next_clips(tracked & ~lost, pos)
             self._phases.fall(over & off & away)
@@ -252,6 +271,35 @@ class Recovering(Goal):
             # Between two clips nothing waits.
             self.lead(rests.nonzero().squeeze(-1), qpos, linvel[:, 0], self.doing == TRACKS)
         return bool((rests | back | (self.doing == FALLS) | over).any())
+
+    def _sits(self) -> Tensor:
+        """`(N,)` bool, worlds on a planned motion that sits down."""
+        if self.seats is None:
+            return torch.zeros_like(self._on)
+        found = [self.seats.sits(i) for i in range(self.num_envs)]
+        return torch.tensor(found, device=self.device)
+
+    def _visit(
+        self, seats: Seats, goal: GeneratorGoal, lost: Tensor, back: Tensor, qpos: Tensor
+    ) -> Tensor:
+        """Ends visits that are lost or over, leads free worlds to seats; `(N,)` bool, those that are to
+        sit down now."""
+        due = torch.zeros_like(lost)
+        for i, q in enumerate(qpos.double().cpu().numpy()):
+            step = int(self.steps[i])
+            seats.watch(i, q)
+            if bool(lost[i] | back[i]):
+                seats.over(i, step, bool(back[i]))
+            to = None
+            # Targets and paths come first.
+            if int(self.doing[i]) == TRACKS and goal.is_free(i):
+                to = seats.leads(i, step, q[:2])
+            if to is None:
+                goal.led.pop(i, None)
+            else:
+                goal.led[i] = torch.from_numpy(to)
+                due[i] = seats.due(i, q[:2])
+        return due
 
     def _off(self, pos: Tensor) -> Tensor:
         return has_lost(pos, self.layout.unpacked(self.now()).pos)
@@ -320,7 +368,10 @@ class Recovering(Goal):
         get_up, again = self._calm if calm else self.get_up, int(self._phases.vain[world])
         if isinstance(self.goal, GeneratorGoal):
             # At its end the character stands as long as the generator's past is.
-            way = way_to_stand(get_up, qpos, again=again)
+            if self.seats is not None and int(self.doing[world]) == TRACKS:
+                way = self.seats.motion(world, int(self.steps[world]), qpos, moves)
+            else:
+                way = way_to_stand(get_up, qpos, again=again)
             return torch.cat((way, way[-1:].expand(self._tail, -1)))
         goal, own, one = self.goal, self.goal.reference, slice(world, world + 1)
         if goal.frame[world] or not self.chained:

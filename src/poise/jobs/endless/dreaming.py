@@ -17,8 +17,11 @@ from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
 from poise.env.generator_goal import GeneratorGoal, Steering
+from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.recovering import Recovering
+from poise.env.recovery.seats import Seats
 from poise.errors import PoiseError
+from poise.jobs.endless.dream_world import footprint, seats_of, with_boxes, with_help, with_pushes
 from poise.jobs.endless.dreamt import (
     ClipMaker,
     Dream,
@@ -32,14 +35,17 @@ from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.controllers import NO_CRITIC, look_ahead
 from poise.jobs.track.placement import place
+from poise.jobs.track.recovery_run import helped
 from poise.jobs.track.surroundings import crowd, places
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.kinematics.rate import read_clip
 from poise.kinematics.travel import find_travel, travelled
 from poise.learn.run import interruptible
+from poise.metrics import help_audit
 from poise.motion import Clip
 from poise.score import simulate
+from poise.score.card import NO_HELP, Help
 from poise.settings import changed
 from poise.sim.guard import UnstableError
 from poise.synthesis.generator import Kinematic
@@ -122,7 +128,14 @@ def dream(
     finally:
         for writer in writers:
             writer.discard()
+    rate_hz = tracker.config.sim.control_hz
+    if config.help_limit > 0:
+        notes.append(
+            f"Helped: a hand that no real person has led the roots with up to {config.help_limit:g} N."
+        )
     return Dreamt(
+        visits=() if goal.seats is None else tuple(goal.seats.visits),
+        strayed=goal.strayed(rate_hz), help=seen.help(config.help_limit, tracker.humanoid.mass),
         tracker=tracker, body=body, characters=tuple(characters),
         lost=tuple((i, s / rate) for i, s in goal.lost),
         back=tuple((i, s / rate) for i, s in goal.back),
@@ -176,12 +189,16 @@ def _go_about(
     notes: list[str],
 ) -> Recovering:
     """Simulates until all steps are made or `seen` has seen enough; the goal that was followed."""
-    steering = Steering(config.targets, config.count > 1)
+    sits, said = seats_of(config.supports)
+    notes += said
+    boxes = tuple(footprint(s) for s in config.supports)
+    steering = Steering(config.targets, config.count > 1, config.path, boxes, bool(sits))
+    going = bool(config.targets) or config.path is not None
 
     def goal(worlds: int, plans: bool) -> Recovering:
         clips = tracker.recovery_clips if config.recover else None
         # Each has its own wishes; where there is somewhere to go, that alone counts.
-        wishing = made.wishing(0.0 if config.targets else config.label_seconds, worlds)
+        wishing = made.wishing(0.0 if going else config.label_seconds, worlds)
         lead = max(config.lookahead.horizon, *tracker.config.window, 1) + 1
         motion = GeneratorGoal(
             wishing, tracker.humanoid, tracker.config.sim.control_hz, worlds, seed=config.seed,
@@ -189,20 +206,30 @@ def _go_about(
             pasts=pasts if plans else pasts[:1].expand(worlds, -1, -1),
             simulated=config.past == "simulated",
         )  # fmt: skip
-        own = Recovering(motion, clips, plans=plans)
+        seats = None
+        if sits and plans and tracker.recovery_clips is not None:
+            get_up = GetUpPlanner(tracker.recovery_clips, tracker.humanoid.table, motion.rate_hz)
+            seats = Seats(sits, tracker.humanoid, get_up, worlds, boxes, config.seed)
+        own = Recovering(motion, clips, plans=plans, seats=seats)
         own.reset(torch.arange(worlds))
         return own
 
     # The body's own task; what it follows is the goal.
     task = imitation_of(tracker, [place(tracker.example, tracker)])
     task = replace(task, task=replace(task.task, help_by="all"))
-    rows = crowd(task.humanoid, task.config.sim, config.count) if config.count > 1 else None
-    env, own = task.env(1, None, False, 1, help_scale=0.0, backend=rows), goal(config.count, True)
+    task = with_pushes(with_boxes(task, config.supports, config.count), config.pushes, config.seed)
+    actor = tracker
+    if config.help_limit > 0:
+        task, actor = with_help(task, tracker, config.help_limit)
+    several = config.count > 1
+    rows = crowd(task.humanoid, task.config.sim, config.count, task.props) if several else None
+    env = task.env(1, None, False, 1, help_scale=helped(task), backend=rows)
+    own = goal(config.count, True)
     seen.goal = own
-    acts: Acts = tracker.policy
+    acts: Acts = actor.policy
     ahead = None
     if config.controller == "lookahead" and tracker.value is not None:
-        acts = ahead = look_ahead(tracker, task, config.lookahead, config.threads, config.seed)
+        acts = ahead = look_ahead(actor, task, config.lookahead, config.threads, config.seed)
         ahead.copies.set_goal(goal(ahead.copies.num_envs, False))
     try:
         while len(seen) < steps and not seen.stopped():
@@ -241,7 +268,8 @@ class _Seen:
         self, characters: list[DreamtCharacter], pieces: list[Pieces], steps: int, show: Show | None
     ):
         self.characters, self.pieces, self.steps, self.show = characters, pieces, steps, show
-        self._all = torch.arange(len(characters))
+        # Of each control step `(4, K, 1, 3)`: force, torque, and how the root moves, see `help_audit`.
+        self._helped = list[Tensor]()
 
     def __len__(self) -> int:
         return self.characters[0].done.count
@@ -256,6 +284,20 @@ class _Seen:
             character.asked.append(asked[k].cpu().numpy())
         for piece in self.pieces:
             piece.more()
+        if (wrench := env.wrench) is not None:
+            pose = env.pose()
+            parts = wrench.force, wrench.torque, pose.linvel[:, :1], pose.angvel[:, :1]
+            self._helped.append(torch.stack([p.double() for p in parts]))
         if self.show is not None:
             self.show("going about", len(self), self.steps)
         return self.stopped()
+
+    def help(self, limit: float, mass: float) -> Help:
+        """What a hand gave with up to `limit` N and N m, to characters of `mass` kg."""
+        if not self._helped:
+            return NO_HELP
+        force, torque, goes, spins = torch.stack(self._helped, 1).unbind(0)
+        found = help_audit(force, torque, goes, spins, mass)
+        names = ("force_mean_n", "force_p95_n", "torque_mean_nm", "torque_p95_nm", "work_j_per_s")
+        used = (getattr(found, name) for name in (*names, "share_of_body_weight"))
+        return Help(limit, limit, *used)

@@ -19,19 +19,23 @@ import numpy as np
 import torch
 
 from poise.body import BodyTable, Humanoid
-from poise.env.generator_goal import Steering
+from poise.env.generator_goal import REACHED, Steering
+from poise.env.recovery.seats import Visit
+from poise.env.walk_path import WalkPath
 from poise.errors import PoiseError
 from poise.formats import check_writable, write_clip
 from poise.formats.text import write_whole
 from poise.jobs.deliver import Delivery
+from poise.jobs.endless.dream_world import DreamPush
 from poise.jobs.result import ABSENT, Result
 from poise.kinematics import hold_feet, lowest_height, qpos_to_clip
 from poise.kinematics.forward import Kinematics, shapes_of
 from poise.kinematics.loops import cut_loop
+from poise.kinematics.supports import Support
 from poise.metrics import foot_points, foot_slide, jerk, lowest_points, penetration
 from poise.motion import Clip
 from poise.plan import LookaheadConfig
-from poise.score.card import NO_HELP
+from poise.score.card import NO_HELP, Help
 from poise.score.report import Report, Shape, Track, write_report
 from poise.settings import Range, validate
 from poise.version import __version__
@@ -49,6 +53,12 @@ class Dream:
         count: characters in one world, which keep away from each other.
         targets: x and y, in m, of points that each character is to reach one after another; it begins at
             the origin.
+        path: that each character follows, in place of targets; None for none.
+        supports: boxes that stand in the world; characters walk round them, and sit down on seats now
+            and then, when they have no target left and are on no path.
+        pushes: on each character.
+        help_limit: N, and N m, that a hand which leads the roots may give at most, by inverse dynamics
+            and a spring; 0 for none. No real person has such help.
         seed: of all draws.
         controller: the policy looks ahead before it acts, or acts at once.
         lookahead: how it looks ahead; its seed is `seed`.
@@ -65,6 +75,10 @@ class Dream:
     temperature: Annotated[float, Range(0, 10)] = 1.0
     count: Annotated[int, Range(1, MOST, unit="characters")] = 1
     targets: tuple[tuple[float, float], ...] = ()
+    path: WalkPath | None = None
+    supports: tuple[Support, ...] = ()
+    pushes: tuple[DreamPush, ...] = ()
+    help_limit: Annotated[float, Range(0, unit="N")] = 0.0
     seed: int = 0
     controller: Literal["lookahead", "policy"] = "lookahead"
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
@@ -78,6 +92,12 @@ class Dream:
     def __post_init__(self) -> None:
         validate(self)
         Steering(self.targets)
+        if self.targets and self.path is not None:
+            raise PoiseError(
+                "a character goes to points or along a path",
+                hint="Leave one of them out",
+                code="option-conflict",
+            )
 
 
 #: Mean speed (m/s) of the bodies over a second below which a character stands still.
@@ -235,6 +255,8 @@ def _part(clip: Clip, first: int, last: int) -> Clip:
     return clip.replaced(root_pos=clip.root_pos[first:last], rot=clip.rot[first:last])
 
 
+#: s on a seat from which on a character sat there.
+SAT_S = 2.0
 #: s before a fall and after getting up that no loop holds.
 FELL_S = 1.0
 #: s of the motion that a report shows.
@@ -258,6 +280,10 @@ class Dreamt(Result):
         lost, back, reached: (character, s) of every time one lost its motion, was up again, or reached a
             target.
         config: how they went about. notes: sentences.
+        visits: times on seats that are over.
+        strayed: of each character that came to its path: s on it, the share of them more than half a
+            metre from it, the mean and the greatest distance from it, m.
+        help: what a hand gave.
         paths: motion files that were written on the way.
     """
 
@@ -267,6 +293,9 @@ class Dreamt(Result):
     back: tuple[tuple[int, float], ...] = ()
     reached: tuple[tuple[int, float], ...] = ()
     config: Dream = ABSENT
+    visits: tuple[Visit, ...] = ()
+    strayed: tuple[tuple[float, float, float, float], ...] = ()
+    help: Help = NO_HELP
     paths: tuple[Path, ...] = ()
 
     @property
@@ -344,9 +373,16 @@ class Dreamt(Result):
     def sentence(self) -> str:
         """What became of it."""
         n = len(self.characters)
-        said = f"{self.seconds:.1f} s without help" + (f", {n} characters" if n > 1 else "")
+        helped = f"with up to {self.help.limit_n:g} N of help" if self.help.limit_n else "without help"
+        said = f"{self.seconds:.1f} s {helped}" + (f", {n} characters" if n > 1 else "")
         if self.config.targets:
             said += f", {len(self.reached)} of {n * len(self.config.targets)} targets reached"
+        if self.strayed:
+            off = float(np.mean([share for _, share, _, _ in self.strayed]))
+            said += f", {100 * (1 - off):.0f} % of the time within {REACHED:g} m of the path"
+        if self.visits:
+            sat = sum(v.sat_s >= SAT_S and v.back for v in self.visits)
+            said += f", on a seat for {SAT_S:g} s and up again {sat} of {len(self.visits)} times"
         if not self.lost:
             return f"{said}, without a fall."
         times = "once" if len(self.lost) == 1 else f"{len(self.lost)} times"
@@ -369,9 +405,19 @@ class Dreamt(Result):
             "characters": len(self.characters), "sentence": self.sentence,
             "seed": self.config.seed, "temperature": self.config.temperature,
             "controller": self.config.controller, "recover": self.config.recover,
-            "past": self.config.past, "style": self.config.style, "help": asdict(NO_HELP),
+            "past": self.config.past, "style": self.config.style, "help": asdict(self.help),
             "falls": times(self.lost), "back": times(self.back), "reached": times(self.reached),
             "falls_per_hour": round(self.falls_per_hour, 2), "stayed_down": self.stayed_down,
+            "visits": [
+                {"character": v.world, "seconds": round(v.step / self.body.fps, 3), "seat": v.seat,
+                 "sat_s": round(v.sat_s, 3), "back": v.back}
+                for v in self.visits
+            ],
+            "path": [
+                {"seconds": round(s, 1), "off_share": round(off, 4), "mean_m": round(mean, 4),
+                 "most_m": round(most, 4)}
+                for s, off, mean, most in self.strayed
+            ],
             **figures,
         }  # fmt: skip
 
@@ -425,6 +471,10 @@ class Dreamt(Result):
             contacts=low[:, list(humanoid.feet)].numpy() < 0.015, score={}, curve={},
             notes=(self.sentence, *self.notes), facts=facts,
             others=tuple(track(c.done, f"character {k}") for k, c in enumerate(others, 2)),
+            things=tuple(
+                Shape(0, "box", (b.size[0] / 2, b.size[1] / 2, b.size[2] / 2), b.pos, b.quat)
+                for b in self.config.supports
+            ),
         )  # fmt: skip
 
 

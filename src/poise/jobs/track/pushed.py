@@ -14,7 +14,7 @@ from poise.body import BodyTable, Humanoid
 from poise.control import Compliance, Stiffness
 from poise.control.compliance import Level, NewtonsPerMetre
 from poise.env import ImitationEnv
-from poise.env.pushes import Push
+from poise.env.pushes import Push, Pushes
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.rotations import quat_rotate
@@ -143,7 +143,7 @@ def with_push(imitation: Imitation, push: PushConfig | None) -> Imitation:
 def unforeseen(imitation: Imitation) -> Imitation:
     """The same task for copies in which a controller looks ahead: they know of no push to come."""
     events = tuple(
-        replace(p, foreseen=False) if isinstance(p, Push) else p for p in imitation.task.events
+        replace(p, foreseen=False) if isinstance(p, Push | Pushes) else p for p in imitation.task.events
     )
     return replace(imitation, task=replace(imitation.task, events=events))
 

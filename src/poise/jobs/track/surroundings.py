@@ -23,7 +23,7 @@ from poise.kinematics.find_supports import find_supports
 from poise.kinematics.supports import Support
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, CharacterRows, Scene, SceneSim, SimConfig
-from poise.sim.props import Box
+from poise.sim.props import Box, Prop
 
 #: Which supports there are, see `TrackConfig.supports`.
 Wanted = Literal["auto", "none"] | tuple[Support, ...]
@@ -148,8 +148,11 @@ def places(count: int) -> np.ndarray:
     return APART_M * np.stack((at // wide, at % wide), 1).astype(float)
 
 
-def crowd(humanoid: Humanoid, sim: SimConfig, count: int) -> CharacterRows:
-    """N copies of a body on one floor, each a row; names of all but the first begin with "2/", ..."""
+def crowd(
+    humanoid: Humanoid, sim: SimConfig, count: int, props: Sequence[Prop | Character] = ()
+) -> CharacterRows:
+    """N copies of a body on one floor, each a row, with what else stands there; names of all but the
+    first begin with "2/", ..."""
     names = ("", *(str(k + 1) for k in range(1, count)))
-    things = tuple(Character(humanoid, name) for name in names)
+    things = (*(Character(humanoid, name) for name in names), *props)
     return SceneSim(Scene(things, sim=sim), 1, threads=1).characters()
