@@ -34,6 +34,7 @@ from poise.jobs.inbetween.fill import inbetween, shipped_model
 from poise.jobs.inbetween.inbetween_settings import Inbetween, small
 from poise.jobs.inbetween.inbetween_training import Task, begin, train
 from poise.jobs.open import open_run
+from poise.jobs.track import TrackConfig
 from poise.kinematics import fit_humanoid, retarget
 from poise.kinematics.forward import lowest_height, poses_of
 from poise.learn.inbetween_model import MODEL, Adaptation, InbetweenModel, adapt, load_model
@@ -41,6 +42,7 @@ from poise.learn.transition import FilledGap, Known, SkeletonLayout
 from poise.metrics import l2p
 from poise.motion import Clip, Skeleton, shifted, trim
 from poise.motion.rotations import forward_kinematics, normalize
+from poise.plan import LookaheadConfig
 from poise.score.gaps import BANDAI, BANDAI_TAKES, GapRow, TestSet, evaluate, predict, score, test_set
 from poise.synthesis.filler import Gap, interpolated
 from poise.synthesis.keyframes import fill_keyframes
@@ -539,7 +541,8 @@ def completed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 
 #: Clips of the styles that choices are made on, and iterations of each gap.
 ADAPTED, ITERATIONS = 10, (0, 20)
-ADAPTED_SECONDS = 3.0
+#: Seconds of each clip; its budget is a quarter of what is usual, and what it loses is not searched.
+ADAPTED_SECONDS, ADAPTED_BUDGET = 2.5, 192.0
 #: m below the floor from which a sole counts as through it.
 THROUGH = 0.005
 
@@ -568,9 +571,10 @@ def adapted_body(places: Places, unit: str) -> Any:
     humanoid, _, report = fit_humanoid(clip)
     clip = shifted(clip, (0.0, 0.0, report.clips[0].ground.lift_m))
     keys = [*range(0, clip.frames - round(0.5 * clip.fps), round(clip.fps)), clip.frames - 1]
-    how: dict[str, Any] = {"lookahead": SMALL} if places.smoke else {}
     count, tracker = min(int(iterations), 1) if places.smoke else int(iterations), open_run(None).tracker
-    done = complete(clip, keys, tracker, threads=1, supports="none", adapt=count, **how)
+    ahead = SMALL if places.smoke else LookaheadConfig().with_budget(ADAPTED_BUDGET)
+    config = TrackConfig(controller="lookahead", lookahead=ahead, threads=1, supports="none")
+    done = complete(clip, keys, tracker, config, adapt=count)
     inside = np.setdiff1d(np.arange(clip.frames), keys)
     out: dict[str, Any] = {"whole": float(not done.failures)}
     stages = {s.name: s for s in done.stages}
