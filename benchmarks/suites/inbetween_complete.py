@@ -30,6 +30,7 @@ from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.own import unpack_clips
 from poise.jobs.complete import complete
+from poise.jobs.deliver import key_errors, stage_of
 from poise.jobs.inbetween.fill import inbetween, shipped_model
 from poise.jobs.inbetween.inbetween_settings import Inbetween, small
 from poise.jobs.inbetween.inbetween_training import Task, begin, train
@@ -560,9 +561,9 @@ def adapted_units(places: Places) -> list[str]:
     return [f"{f.stem}; adapt {n}" for f in files for n in ITERATIONS]
 
 
-def adapted_body(places: Places, unit: str) -> Any:
-    """A clip with a keyframe each second: how far the filled motion and the body are from the recorded
-    one, in between, and how soles sink and slide. The recorded one is set on the floor first."""
+def adapted(places: Places, unit: str, body: bool = False) -> Any:
+    """A clip with a keyframe each second: how far the filled motion is from the recorded one in between,
+    and how soles sink and slide; and a body that does it. The recorded one is set on the floor first."""
     stem, _, iterations = unit.partition("; adapt ")
     files = [WALK] if places.smoke else held_back(places)
     clip = read_clip(next(f for f in files if f.stem == stem))
@@ -571,32 +572,43 @@ def adapted_body(places: Places, unit: str) -> Any:
     humanoid, _, report = fit_humanoid(clip)
     clip = shifted(clip, (0.0, 0.0, report.clips[0].ground.lift_m))
     keys = [*range(0, clip.frames - round(0.5 * clip.fps), round(clip.fps)), clip.frames - 1]
-    count, tracker = min(int(iterations), 1) if places.smoke else int(iterations), open_run(None).tracker
-    ahead = SMALL if places.smoke else LookaheadConfig().with_budget(ADAPTED_BUDGET)
-    config = TrackConfig(controller="lookahead", lookahead=ahead, threads=1, supports="none")
-    done = complete(clip, keys, tracker, config, adapt=count)
+    count = min(int(iterations), 1) if places.smoke else int(iterations)
+    if body:
+        ahead = SMALL if places.smoke else LookaheadConfig().with_budget(ADAPTED_BUDGET)
+        config = TrackConfig(controller="lookahead", lookahead=ahead, threads=1, supports="none")
+        done = complete(clip, keys, open_run(None).tracker, config, adapt=count)
+        motions = {"filled": done.came, "simulated": done.delivered(hold=False)}
+    else:
+        done = inbetween(clip, keys, adapt=count)
+        motions = {"filled": done.clip}
     inside = np.setdiff1d(np.arange(clip.frames), keys)
-    out: dict[str, Any] = {"whole": float(not done.failures)}
-    stages = {s.name: s for s in done.stages}
-    for name, made in (("filled", done.came), ("simulated", done.delivered(hold=False))):
+    out: dict[str, Any] = {"whole": float(not done.failures)} if body else {}
+    for name, made in motions.items():
+        stage = stage_of(name, made, key_errors(made, clip, keys, keys))
         off = np.linalg.norm(made.positions() - clip.positions(), axis=-1)[inside]
         soles = lowest_height(humanoid.table, *poses_of(made, humanoid.table))[:, list(humanoid.feet)]
         out |= {
             f"{name}_error_mm": 1000 * float(off.mean()),
             f"{name}_fp_mm": 1000 * float(np.minimum(soles, 0.0)[inside].mean()),
             f"{name}_fq_percent": 100 * float((soles < -THROUGH)[inside].mean()),
-            f"{name}_slide_mm_per_s": stages[name].sole_slide_mm_per_s,
-            f"{name}_keyframes_mm": stages[name].key_mm,
+            f"{name}_slide_mm_per_s": stage.sole_slide_mm_per_s,
+            f"{name}_keyframes_mm": stage.key_mm,
         }
     return out
 
 
-def adapted_body_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+def adapted_body(places: Places, unit: str) -> Any:
+    """The same, done by a body."""
+    return adapted(places, unit, True)
+
+
+def adapted_unit_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Means of the clips, and the mean of what adaptation changes with its interval."""
     by: dict[int, list[Any]] = {
         n: [raw for unit, raw in raws.items() if unit.endswith(f"; adapt {n}")] for n in ITERATIONS
     }
-    title = "poise complete, clips for choices, a keyframe a second; adapt {}"
+    verb = "complete" if "whole" in next(iter(raws.values())) else "inbetween"
+    title = f"poise {verb}, clips for choices, a keyframe a second; adapt {{}}"
     for n, found in by.items():
         values = {k: mean_of(r[k] for r in found) for k in found[0]}
         yield from of(title.format(n), values, len(found))
@@ -692,12 +704,20 @@ PARTS = {
         hours=0.3,
     ),
     "adapt": Part(
+        "test-time adaptation, frames alone",
+        adapted_units,
+        adapted,
+        adapted_unit_rows,
+        _SHIPS,
+        hours=0.03,
+    ),
+    "adapt-body": Part(
         "test-time adaptation, from keyframes to a body",
         adapted_units,
         adapted_body,
-        adapted_body_rows,
+        adapted_unit_rows,
         ("tracker", "inbetween"),
-        hours=0.3,
+        hours=0.1,
     ),
     "speeds": Part(
         "the fastest joints of filled motion", filled_files, fastest, fastest_rows, _SHIPS, hours=0.05
