@@ -50,7 +50,7 @@ from poise.motion.roles import find_roles
 from poise.motion.rotations import forward_kinematics, quat_between, quat_to_rotvec
 from poise.motion.skeleton import Source
 from poise.papers.compliant.scene_training import digest_of
-from poise.papers.skeleton2humanoid.recipe import Budget, as_high, build, posed, settings
+from poise.papers.skeleton2humanoid.recipe import Budget, as_came, build, posed, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force_settings import ResidualForce
 from poise.score.gaps import BANDAI, deviation
@@ -285,7 +285,7 @@ def corrected(places: Places, unit: str) -> Any:
     folder = places.work / "s2h" / f"{n}-{re.sub('[^a-z]+', '-', variant)}-{seed}"
     clips = ClipLibrary.of(b.adapted if adapt else filled(b.test.truth, n, 0))
     task = begin(folder, posed(clips) if analytic else clips, own)
-    task = task if floor else as_high(task)
+    task = task if floor else as_came(task)
     return policy_row(task, folder, budget(places).iterations, b.truth, b.std, n)
 
 
@@ -304,7 +304,7 @@ def staged(places: Places, unit: str) -> Any:
         return of_reference(build(ClipLibrary.of(clips), b.task.config, **left_out).reference)
 
     if kind == TWIN:
-        high = as_high(b.task)
+        high = as_came(b.task)
         return apart_mm(of_reference(high.reference), twin(b.adapted, high))
     made: dict[str, Callable[[], Motion]] = {
         "recorded": lambda: b.truth,
@@ -312,7 +312,7 @@ def staged(places: Places, unit: str) -> Any:
         "base": lambda: on_joints(filled(b.test.truth, n, 0), b.joints),
         "base + TTA": lambda: on_joints(b.adapted, b.joints),
         "base + IK": lambda: converted(filled(b.test.truth, n, 0), floor=False),
-        "base + TTA + IK": lambda: of_reference(as_high(b.task).reference),
+        "base + TTA + IK": lambda: of_reference(as_came(b.task).reference),
         "base + TTA + IK + set on the floor": lambda: of_reference(b.task.reference),
         "base + TTA + set on the floor": lambda: converted(b.adapted, analytic=False),
     }

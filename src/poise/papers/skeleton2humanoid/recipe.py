@@ -29,13 +29,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
 from poise.body import BodyConfig, generate_table
 from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.inbetween.fill import inbetween
-from poise.kinematics import clip_ik, ik_body, qpos_to_clip
+from poise.kinematics import clip_ik, clip_to_qpos, ik_body, qpos_to_clip
 from poise.kinematics.place import on_own_body
 from poise.learn import PPOConfig
 from poise.motion import Clip, ClipLibrary, resample
@@ -136,15 +134,10 @@ def posed(clips: Clips, body: BodyConfig | None = None) -> ClipLibrary:
     return replace(library, clips=tuple(c.replaced(root_pos=m.root_pos, rot=m.rot) for c, m in kept))
 
 
-def as_high(imitation: Imitation) -> Imitation:
-    """The same task with the motions as high as they came, not set on the floor."""
+def as_came(imitation: Imitation) -> Imitation:
+    """The same task with the motions as they came: no joint slowed down, and not set on the floor."""
     ref, humanoid = imitation.reference, imitation.humanoid
-    pelvis = humanoid.table.rows[0].joint
-    motions = list[np.ndarray]()
-    for clip, first, length in zip(imitation.library, ref.start, ref.length, strict=True):
-        qpos = ref.qpos[first : first + length].numpy().copy()
-        qpos[:, 2] = resample(clip, ref.rate_hz).positions()[:length, pelvis, 2]
-        motions.append(qpos)
+    motions = [clip_to_qpos(resample(c, ref.rate_hz), humanoid.table) for c in imitation.library]
     reference = Reference(humanoid, motions, ref.rate_hz, ref.names, ref.cyclic.tolist())
     return replace(imitation, reference=reference)
 
@@ -157,11 +150,12 @@ def build(
 
     Args:
         analytic: the angles are those of `posed`; False takes the clips' own.
-        floor: the motions are set on the floor, which the paper does not do.
+        floor: the motions are set on the floor, and joints faster than people's slowed down; the paper
+            does neither.
     """
     config = config or settings()
     made = imitation_of(posed(clips, config.body) if analytic else clips, config)
-    return made if floor else as_high(made)
+    return made if floor else as_came(made)
 
 
 def pipeline(
