@@ -23,23 +23,27 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.clips import RFC, WALK, Places
-from benchmarks.common.rows import Figure, mean_of, of
+from benchmarks.common.rows import Figure, between, mean_of, of
 from benchmarks.common.runner import Part, Raws
 from benchmarks.suites.lookahead_search import SMALL
 from poise.errors import PoiseError
 from poise.formats import read_clip, write_clip
 from poise.formats.own import unpack_clips
 from poise.jobs.complete import complete
+from poise.jobs.deliver import key_errors, stage_of
 from poise.jobs.inbetween.fill import inbetween, shipped_model
 from poise.jobs.inbetween.inbetween_settings import Inbetween, small
 from poise.jobs.inbetween.inbetween_training import Task, begin, train
 from poise.jobs.open import open_run
-from poise.kinematics import retarget
+from poise.jobs.track import TrackConfig
+from poise.kinematics import fit_humanoid, retarget
+from poise.kinematics.forward import lowest_height, poses_of
 from poise.learn.inbetween_model import MODEL, Adaptation, InbetweenModel, adapt, load_model
 from poise.learn.transition import FilledGap, Known, SkeletonLayout
 from poise.metrics import l2p
-from poise.motion import Clip, Skeleton, trim
+from poise.motion import Clip, Skeleton, shifted, trim
 from poise.motion.rotations import forward_kinematics, normalize
+from poise.plan import LookaheadConfig
 from poise.score.gaps import BANDAI, BANDAI_TAKES, GapRow, TestSet, evaluate, predict, score, test_set
 from poise.synthesis.filler import Gap, interpolated
 from poise.synthesis.keyframes import fill_keyframes
@@ -534,6 +538,93 @@ def completed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     yield Figure("poise complete, standing on the first keyframe", "keyframes_met_mm", still, len(raws))
 
 
+# --- adaptation, from keyframes to a body -----------------------------------------------------------
+
+#: Clips of the styles that choices are made on, and iterations of each gap.
+ADAPTED, ITERATIONS = 10, (0, 20)
+#: Seconds of each clip; its budget is a quarter of what is usual, and what it loses is not searched.
+ADAPTED_SECONDS, ADAPTED_BUDGET = 2.5, 192.0
+#: m below the floor from which a sole counts as through it.
+THROUGH = 0.005
+
+
+def held_back(places: Places) -> list[Path]:
+    """Bandai's clips for choices, evenly spread."""
+    folder = places.data / "other" / "bandai_bvh"
+    found = [f for f in sorted(folder.glob("*.bvh")) if BANDAI.part_of(f.name) == "validation"]
+    return [found[round(i * (len(found) - 1) / (ADAPTED - 1))] for i in range(ADAPTED)]
+
+
+def adapted_units(places: Places) -> list[str]:
+    """Clips with and without adaptation."""
+    files = [WALK] if places.smoke else held_back(places)
+    return [f"{f.stem}; adapt {n}" for f in files for n in ITERATIONS]
+
+
+def adapted(places: Places, unit: str, body: bool = False) -> Any:
+    """A clip with a keyframe each second: how far the filled motion is from the recorded one in between,
+    and how soles sink and slide; and a body that does it. The recorded one is set on the floor first."""
+    stem, _, iterations = unit.partition("; adapt ")
+    files = [WALK] if places.smoke else held_back(places)
+    clip = read_clip(next(f for f in files if f.stem == stem))
+    seconds = 1.2 if places.smoke else ADAPTED_SECONDS
+    clip = trim(clip, 0, min(clip.frames, round(seconds * clip.fps)) - 1)
+    humanoid, _, report = fit_humanoid(clip)
+    clip = shifted(clip, (0.0, 0.0, report.clips[0].ground.lift_m))
+    keys = [*range(0, clip.frames - round(0.5 * clip.fps), round(clip.fps)), clip.frames - 1]
+    count = min(int(iterations), 1) if places.smoke else int(iterations)
+    if body:
+        ahead = SMALL if places.smoke else LookaheadConfig().with_budget(ADAPTED_BUDGET)
+        config = TrackConfig(controller="lookahead", lookahead=ahead, threads=1, supports="none")
+        done = complete(clip, keys, open_run(None).tracker, config, adapt=count)
+        motions = {"filled": done.came, "simulated": done.delivered(hold=False)}
+    else:
+        done = inbetween(clip, keys, adapt=count)
+        motions = {"filled": done.clip}
+    inside = np.setdiff1d(np.arange(clip.frames), keys)
+    out: dict[str, Any] = {"whole": float(not done.failures)} if body else {}
+    for name, made in motions.items():
+        stage = stage_of(name, made, key_errors(made, clip, keys, keys))
+        off = np.linalg.norm(made.positions() - clip.positions(), axis=-1)[inside]
+        soles = lowest_height(humanoid.table, *poses_of(made, humanoid.table))[:, list(humanoid.feet)]
+        out |= {
+            f"{name}_error_mm": 1000 * float(off.mean()),
+            f"{name}_fp_mm": 1000 * float(np.minimum(soles, 0.0)[inside].mean()),
+            f"{name}_fq_percent": 100 * float((soles < -THROUGH)[inside].mean()),
+            f"{name}_slide_mm_per_s": stage.sole_slide_mm_per_s,
+            f"{name}_keyframes_mm": stage.key_mm,
+        }
+    return out
+
+
+def adapted_body(places: Places, unit: str) -> Any:
+    """The same, done by a body."""
+    return adapted(places, unit, True)
+
+
+def adapted_unit_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Means of the clips, and the mean of what adaptation changes with its interval."""
+    by: dict[int, list[Any]] = {
+        n: [raw for unit, raw in raws.items() if unit.endswith(f"; adapt {n}")] for n in ITERATIONS
+    }
+    verb = "complete" if "whole" in next(iter(raws.values())) else "inbetween"
+    title = f"poise {verb}, clips for choices, a keyframe a second; adapt {{}}"
+    for n, found in by.items():
+        values = {k: mean_of(r[k] for r in found) for k in found[0]}
+        yield from of(title.format(n), values, len(found))
+    none, some_ = (by[n] for n in ITERATIONS)
+    for key in none[0]:
+        pairs = [(a[key], b[key]) for a, b in zip(none, some_, strict=True)]
+        change = [b - a for a, b in pairs if a is not None and b is not None]
+        yield Figure(
+            title.format(f"{ITERATIONS[1]}, change"),
+            key,
+            mean_of(change),
+            len(change),
+            between(change),
+        )
+
+
 #: Dances, jumps and walks that are filled alone.
 KINEMATIC = (
     "cmu_amc/0[1-9]/*.amc",
@@ -611,6 +702,22 @@ PARTS = {
         completed_rows,
         ("tracker", "inbetween"),
         hours=0.3,
+    ),
+    "adapt": Part(
+        "test-time adaptation, frames alone",
+        adapted_units,
+        adapted,
+        adapted_unit_rows,
+        _SHIPS,
+        hours=0.03,
+    ),
+    "adapt-body": Part(
+        "test-time adaptation, from keyframes to a body",
+        adapted_units,
+        adapted_body,
+        adapted_unit_rows,
+        ("tracker", "inbetween"),
+        hours=0.1,
     ),
     "speeds": Part(
         "the fastest joints of filled motion", filled_files, fastest, fastest_rows, _SHIPS, hours=0.05

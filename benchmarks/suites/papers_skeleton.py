@@ -3,10 +3,13 @@
 Each window is 10 recorded frames of Bandai's, a transition, and 5 recorded frames; the in-betweening
 network that comes with Poise, which has learned none of them, makes the transition. Policies are trained
 on the very motions that they correct, as in the paper; that of poise track is not. The analytic inverse
-kinematics see places of joints alone; what policies correct has the clips' own angles and is set on the
-floor. FP and FQ are of soles, not of joint centres, which lie above the floor in these clips: FQ is the
-share of feet more than 5 mm below it. Help stands beside every row; "base" is the null, which nothing
-corrects.
+kinematics see places of joints alone; policies correct what they give, set on the floor, and rows of
+their own leave out the adaptation, the inverse kinematics or the floor. FP and FQ are of soles, not of
+joint centres, which lie above the floor in these clips: FQ is the share of feet more than 5 mm below it.
+Help stands beside every row; "base" is the null, which nothing corrects.
+
+Places alone also come in from keypoints: there the rotations of the analytic inverse kinematics stand
+beside those of the fit that reads them.
 """
 
 from __future__ import annotations
@@ -19,27 +22,35 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.common.clips import WALK, Places
 from benchmarks.common.policies import stated
-from benchmarks.common.rows import Figure, of
+from benchmarks.common.rows import Figure, mean_of, of
 from benchmarks.common.runner import Part, Raws
+from poise.body import generate_table
 from poise.env import Reference
 from poise.formats import read_clip
+from poise.formats.landmarks import complete
+from poise.formats.point_fit import JOINT_PLACES, FitConfig, bones_of, fit_clip
+from poise.formats.point_skeleton import hold_lengths, measure, trunk_tracks
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track import track
-from poise.kinematics import IkBody, clip_ik, fit_humanoid
+from poise.kinematics import IkBody, analytic_ik, clip_ik, fit_humanoid, ik_body, qpos_to_clip
 from poise.kinematics.forward import lowest_height
 from poise.learn import Until
 from poise.metrics import l2p
-from poise.motion import Clip, ClipLibrary, shifted, trim
-from poise.motion.rotations import forward_kinematics
+from poise.motion import Clip, ClipLibrary, resample, shifted, trim
+from poise.motion.keypoints import Keypoints
+from poise.motion.roles import find_roles
+from poise.motion.rotations import forward_kinematics, quat_between, quat_to_rotvec
+from poise.motion.skeleton import Source
 from poise.papers.compliant.scene_training import digest_of
-from poise.papers.skeleton2humanoid.recipe import Budget, build, settings
+from poise.papers.skeleton2humanoid.recipe import Budget, as_came, build, posed, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force_settings import ResidualForce
 from poise.score.gaps import BANDAI, deviation
@@ -119,11 +130,22 @@ def figures(made: Motion, truth: Motion, task: Imitation, std: Tensor, length: i
     }
 
 
-def by_joints(clips: list[Clip], task: Imitation) -> Motion:
-    """The body as the analytic inverse kinematics pose it from the places of the clips' joints."""
+def of_reference(reference: Reference) -> Motion:
+    """The motions of a task, which are as long as each other."""
+    count = len(reference.length)
+    return Motion(*(x.unflatten(0, (count, -1)) for x in (reference.pose.pos, reference.pose.quat)))
+
+
+def twin(clips: list[Clip], task: Imitation) -> Motion:
+    """The body as the analytic inverse kinematics pose it, without the recipe."""
     body, names = IkBody.of(task.humanoid), [c.name for c in clips]
-    posed = Reference(task.humanoid, [clip_ik(c, body) for c in clips], FPS, names).pose
-    return Motion(*(x.unflatten(0, (len(clips), -1)) for x in (posed.pos, posed.quat)))
+    return of_reference(Reference(task.humanoid, [clip_ik(c, body) for c in clips], FPS, names))
+
+
+def apart_mm(a: Motion, b: Motion) -> dict[str, float]:
+    """How far bodies of the same motions are from each other."""
+    off = 1000 * (a.pos - b.pos).norm(dim=-1)
+    return {"mean_mm": round(float(off.mean()), 4), "worst_mm": round(float(off.max()), 4)}
 
 
 def policy_row(
@@ -179,8 +201,27 @@ def tracked_row(
 
 COUNT, ITERATIONS = 32, 60
 LENGTHS = (5, 15, 30)
-KINEMATIC = ("recorded", "base", "base + TTA", "base + TTA + IK", "base + TTA + set on the floor")
+TTA = 20
+KINEMATIC = (
+    "recorded",
+    "recorded, set on the floor",
+    "base",
+    "base + TTA",
+    "base + IK",
+    "base + TTA + IK",
+    "base + TTA + IK + set on the floor",
+    "base + TTA + set on the floor",
+)
 LOOKS = "base + TTA + universal policy with lookahead"
+TWIN = "base + TTA + IK, beside kinematics.clip_ik"
+#: What a policy of all stages goes without, at the longest transition: iterations of adaptation, the
+#: inverse kinematics, the floor.
+WITHOUT: dict[str, tuple[int, bool, bool]] = {
+    "full": (TTA, True, True),
+    "full, without adaptation": (0, True, True),
+    "full, without inverse kinematics": (TTA, False, True),
+    "full, without the floor": (TTA, True, False),
+}
 
 
 class Bench(NamedTuple):
@@ -198,7 +239,7 @@ class Bench(NamedTuple):
 def bench(places: Places, length: int) -> Bench:
     """Windows, transitions after adaptation, and the task on them."""
     test = toys(length) if places.smoke else windows(places.data, length, COUNT)
-    adapted = filled(test.truth, length, 1 if places.smoke else 20)
+    adapted = filled(test.truth, length, 1 if places.smoke else TTA)
     task = build(ClipLibrary.of(adapted), settings("full", budget(places)))
     joints = [r.joint for r in task.humanoid.table.rows]
     names = task.humanoid.skeleton.names
@@ -219,39 +260,61 @@ def budget(places: Places) -> Budget:
 
 
 def units(places: Places) -> list[str]:
-    """Lengths and stages."""
+    """Lengths and policies."""
     if places.smoke:
-        return [f"5 frames; {k}" for k in ("recorded", "base", "full, seed 0")]
-    rows = [f"{n} frames; {k}" for n in LENGTHS for k in (*KINEMATIC, LOOKS)]
-    return rows + [f"{n} frames; {v}, seed {s}" for n in LENGTHS for v in VARIANTS for s in (0, 1)]
+        return ["5 frames; full, seed 0", "5 frames; full, without the floor, seed 0"]
+    rows = [f"{n} frames; {LOOKS}" for n in LENGTHS]
+    rows += [f"{n} frames; {v}, seed {s}" for n in LENGTHS for v in VARIANTS for s in (0, 1)]
+    return rows + [f"{LENGTHS[-1]} frames; {v}, seed 0" for v in WITHOUT if v not in VARIANTS]
 
 
 def corrected(places: Places, unit: str) -> Any:
-    """One stage."""
+    """One policy."""
     what, _, kind = unit.partition("; ")
     n = int(what.split()[0])
     b = bench(places, n)
-    variant, _, seed = kind.partition(", seed ")
-    if seed:
-        own = settings(variant, budget(places), seed=int(seed))
-        if places.smoke:
-            own = replace(
-                own, ppo=replace(own.ppo, minibatch=16, norm_warmup=2, policy_hidden=(8,)), expert=False
-            )
-        folder = places.work / "s2h" / f"{n}-{variant.replace(' ', '-')}-{seed}"
-        task = begin(folder, ClipLibrary.of(b.adapted), own)
-        return policy_row(task, folder, budget(places).iterations, b.truth, b.std, n)
     if kind == LOOKS:
         return tracked_row(b.adapted, b.joints, b.task, b.truth, b.std, n)
-    pose, many = b.task.reference.pose, len(b.test.truth)
+    variant, _, seed = kind.partition(", seed ")
+    adapt, analytic, floor = WITHOUT.get(variant, WITHOUT["full"])
+    own = settings("full" if variant in WITHOUT else variant, budget(places), seed=int(seed))  # type: ignore[arg-type]
+    if places.smoke:
+        own = replace(
+            own, ppo=replace(own.ppo, minibatch=16, norm_warmup=2, policy_hidden=(8,)), expert=False
+        )
+    folder = places.work / "s2h" / f"{n}-{re.sub('[^a-z]+', '-', variant)}-{seed}"
+    clips = ClipLibrary.of(b.adapted if adapt else filled(b.test.truth, n, 0))
+    task = begin(folder, posed(clips) if analytic else clips, own)
+    task = task if floor else as_came(task)
+    return policy_row(task, folder, budget(places).iterations, b.truth, b.std, n)
+
+
+def stage_units(places: Places) -> list[str]:
+    """Lengths and stages without a policy."""
+    return [f"{n} frames; {k}" for n in ((5,) if places.smoke else LENGTHS) for k in (*KINEMATIC, TWIN)]
+
+
+def staged(places: Places, unit: str) -> Any:
+    """One stage without a policy, through the recipe."""
+    what, _, kind = unit.partition("; ")
+    n = int(what.split()[0])
+    b = bench(places, n)
+
+    def converted(clips: list[Clip], **left_out: bool) -> Motion:
+        return of_reference(build(ClipLibrary.of(clips), b.task.config, **left_out).reference)
+
+    if kind == TWIN:
+        high = as_came(b.task)
+        return apart_mm(of_reference(high.reference), twin(b.adapted, high))
     made: dict[str, Callable[[], Motion]] = {
         "recorded": lambda: b.truth,
+        "recorded, set on the floor": lambda: converted(b.test.truth, analytic=False),
         "base": lambda: on_joints(filled(b.test.truth, n, 0), b.joints),
         "base + TTA": lambda: on_joints(b.adapted, b.joints),
-        "base + TTA + IK": lambda: by_joints(b.adapted, b.task),
-        "base + TTA + set on the floor": lambda: Motion(
-            *(x.unflatten(0, (many, -1)) for x in (pose.pos, pose.quat))
-        ),
+        "base + IK": lambda: converted(filled(b.test.truth, n, 0), floor=False),
+        "base + TTA + IK": lambda: of_reference(as_came(b.task).reference),
+        "base + TTA + IK + set on the floor": lambda: of_reference(b.task.reference),
+        "base + TTA + set on the floor": lambda: converted(b.adapted, analytic=False),
     }
     return figures(made[kind](), b.truth, b.task, b.std, n)
 
@@ -263,9 +326,146 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
         policy = stated(("inbetween",)) if "base" in kind else ""
         policy = stated(("inbetween", "tracker")) if kind == LOOKS else policy
         if ", seed " in kind:
-            policy = f"{kind.partition(',')[0]} (trained for this table)"
+            policy = f"{kind.rpartition(', seed')[0]} (trained for this table)"
         values = {k: v for k, v in raw.items() if k not in ("samples", "minutes", "policy")}
         yield from of(f"Skeleton2Humanoid, {unit}", values, 2 if places.smoke else COUNT, policy=policy)
 
 
-PARTS = {"skeleton": Part("Skeleton2Humanoid, Tables 1 and 4", units, corrected, rows, hours=6.0)}
+# --- places alone -----------------------------------------------------------------------------------
+
+#: mm of white noise in three directions together, and whether it is taken off first.
+SEEN = ((0.0, False), (10.0, False), (10.0, True))
+PLACES_SECONDS, PLACES_FPS = 10.0, 30.0
+ROLES = {
+    "hips": "pelvis", "spine": "spine", "neck": "neck", "head": "head", "clavicle": "collar",
+    "upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "thigh": "hip", "shin": "knee",
+    "foot": "ankle", "toes": "toe",
+}  # fmt: skip
+
+
+def clips_of_places(places: Places) -> dict[str, Path]:
+    """Five recordings of CMU's and five of Bandai's."""
+    if places.smoke:
+        return {"walk": WALK}
+    sets = (
+        sorted(places.data.glob("cmu_amc/*/*.amc")),
+        sorted(places.data.glob("other/bandai_bvh/dataset-1_*normal*.bvh")),
+    )
+    picked = [f[round(i * (len(f) - 1) / 4)] for f in sets for i in range(5)]
+    return {f.stem: f for f in picked}
+
+
+def places_seen(clip: Clip, noise_mm: float, raw: bool) -> tuple[Keypoints, list[int]]:
+    """The joints of a clip as keypoints, and which joint each is."""
+    names = dict[str, int]()
+    for role in find_roles(clip.skeleton).rows:
+        place = ROLES.get(role.kind)
+        if place is not None:
+            name = f"{role.side}_{place}" if role.side else place
+            names.setdefault(role.role if place == "spine" else name, role.joint)
+    joints = list(names.values())
+    pos = clip.positions()[:, joints]
+    pos = pos + np.random.default_rng(0).normal(size=pos.shape) * noise_mm / 1000 / np.sqrt(3)
+    return Keypoints(tuple(names), pos, clip.fps, clip.name, source=Source(raw=raw)), joints
+
+
+def by_analytic_ik(points: Keypoints, fitted: Clip) -> Clip:
+    """The skeleton that was measured on keypoints, posed by the analytic inverse kinematics from the
+    tracks that the fit sees."""
+    config = FitConfig()
+    marks = complete(points, config.max_gap_s, config.drop_spikes, config.smooth_hz)
+    tracks, spine = trunk_tracks(dict(marks.tracks), [])
+    rest = measure(tracks, spine, [])
+    tracks = hold_lengths(tracks, bones_of(rest))
+    skeleton, pos = fitted.skeleton, fitted.positions()
+    at = {n: tracks[p] if p else pos[:, skeleton.index(n)] for n, p in rest.points.items()}
+    table = generate_table(skeleton, ResidualForce().body, [fitted])
+    seen = np.stack([at[n] for n in skeleton.names], 1)
+    qpos = analytic_ik(seen, ik_body(table, skeleton), names=skeleton.names)
+    return qpos_to_clip(qpos, table, skeleton, fitted.fps, name=fitted.name)
+
+
+def places_units(places: Places) -> list[str]:
+    """Clips, noise, and whether it is left as it is."""
+    how = [f"{mm:g} mm{', as it is' if raw else ''}" for mm, raw in SEEN]
+    return [f"{name}; {seen}" for name in clips_of_places(places) for seen in how]
+
+
+def placed(places: Places, unit: str) -> Any:
+    """Rotations from places alone, by the fit and by the analytic inverse kinematics: how far joints lie
+    from where they were, how far bones turn beyond a constant turn, and how smooth that is."""
+    stem, _, seen = unit.partition("; ")
+    noise, raw = float(seen.split()[0]), seen.endswith("as it is")
+    clip = resample(read_clip(clips_of_places(places)[stem]), PLACES_FPS)
+    clip = trim(clip, 0, min(clip.frames, round(PLACES_SECONDS * PLACES_FPS)) - 1)
+    points, joints = places_seen(clip, noise, raw)
+    fitted, truth = fit_clip(points), clip.positions()
+    pairs = [
+        (fitted.skeleton.index(j), joints[points.names.index(p)])
+        for j, p in JOINT_PLACES.items()
+        if j in fitted.skeleton.names and p in points.names
+    ]
+    mine, theirs = map(list, zip(*pairs, strict=True))
+    still = np.linalg.norm(truth - truth[:1], axis=-1)[:, theirs]
+    out = {"still_mm": 1000 * float(still.mean()), "recorded_jerk": turning_jerk(clip, theirs)}
+    for name, make in (
+        ("fit", lambda: fit_clip(points)),
+        ("ik", lambda: by_analytic_ik(points, fitted)),
+    ):
+        begun = time.process_time()
+        made = make()
+        took = time.process_time() - begun
+        off = 1000 * np.linalg.norm(made.positions()[:, mine] - truth[:, theirs], axis=-1)
+        out |= {
+            f"{name}_mm": float(off.mean()),
+            f"{name}_p95_mm": float(np.quantile(off, 0.95)),
+            f"{name}_turn_deg": turned_apart(made, mine, clip, theirs),
+            f"{name}_jerk_rad_per_s3": turning_jerk(made, mine),
+            f"{name}_cpu_ms": 1000 * took,
+        }
+    return out
+
+
+def turning_jerk(clip: Clip, joints: list[int]) -> float:
+    """The second difference of local turning speeds, rad/s^3, in the mean of joints and frames."""
+    q = clip.rot[:, joints]
+    speed = quat_to_rotvec(quat_between(q[:-1], q[1:])) * clip.fps
+    return float(np.linalg.norm(np.diff(speed, n=2, axis=0), axis=-1).mean() * clip.fps**2)
+
+
+def turned_apart(made: Clip, mine: list[int], truth: Clip, theirs: list[int]) -> float:
+    """Mean angle, degrees, between world rotations of bones beyond a constant turn of each, which is how
+    two skeletons name their axes."""
+    between = quat_between(truth.world()[1][:, theirs], made.world()[1][:, mine])
+    # The mean turn is the eigenvector of the largest eigenvalue of sum q q^T (Markley et al. 2007).
+    mean = np.linalg.eigh(np.einsum("tji,tjk->jik", between, between))[1][..., -1]
+    cosine = np.abs((between * mean).sum(-1)).clip(max=1.0)
+    return float(np.degrees(2 * np.arccos(cosine)).mean())
+
+
+def placed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Means of the clips by noise, by the fit that reads keypoints and by the analytic IK."""
+    for seen in dict.fromkeys(unit.partition("; ")[2] for unit in raws):
+        found = [raw for unit, raw in raws.items() if unit.endswith(f"; {seen}")]
+        title = f"Skeleton2Humanoid, places alone, noise {seen}"
+        for key, name in (("fit", "the fit of keypoints"), ("ik", "analytic IK")):
+            values = {
+                k.removeprefix(f"{key}_"): mean_of(r[k] for r in found)
+                for k in found[0]
+                if k.startswith(f"{key}_")
+            }
+            yield from of(f"{title}; {name}", values, len(found))
+        still, jerk = (mean_of(r[k] for r in found) for k in ("still_mm", "recorded_jerk"))
+        yield Figure(f"{title}; nothing moves", "mm", still, len(found))
+        yield Figure(f"{title}; as recorded", "jerk_rad_per_s3", jerk, len(found))
+
+
+PARTS = {
+    "skeleton": Part("Skeleton2Humanoid, Tables 1 and 4: policies", units, corrected, rows, hours=7.0),
+    "skeleton-stages": Part(
+        "Skeleton2Humanoid, Table 1: stages I and II and the floor", stage_units, staged, rows, hours=0.1
+    ),
+    "skeleton-places": Part(
+        "rotations from places of joints alone", places_units, placed, placed_rows, hours=0.02
+    ),
+}

@@ -17,7 +17,14 @@ from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.pushed import PushConfig, back_after, from_the_front, row_of, unforeseen, with_push
+from poise.jobs.track.pushed import (
+    PushConfig,
+    back_after,
+    from_the_front,
+    row_of,
+    unforeseen,
+    with_forces,
+)
 from poise.jobs.tracker import Tracker
 from poise.recipes.imitation import Imitation
 from refusals import refused
@@ -77,7 +84,7 @@ def test_more_compliance_gives_way_farther(tracker: Tracker) -> None:
 
 def test_lookahead_knows_of_no_push_to_come(task: Imitation) -> None:
     """Copies act alike before the push, and feel it from when it acts."""
-    given = with_push(task, PushConfig(100.0, start_s=0.2, seconds=0.1))
+    given = with_forces(task, (PushConfig(100.0, start_s=0.2, seconds=0.1),))
     env = given.env(1, auto_reset=False, threads=1, help_scale=0.0)
     copies = unforeseen(given).env(4, auto_reset=False, threads=1, help_scale=0.0)
     zero = torch.zeros(1, dtype=torch.long)
@@ -150,9 +157,9 @@ def test_pushes_that_are_none(given: dict[str, object], what: tuple) -> None:
 
 def test_what_cannot_be_pushed(task: Imitation, tracker: Tracker) -> None:
     with refused("push-too-late", says="9"):
-        with_push(task, PushConfig(start_s=9.0))
+        with_forces(task, (PushConfig(start_s=9.0),))
     with refused("unknown-body-part", says="wing"):
-        with_push(task, PushConfig(at="wing"))
+        with_forces(task, (PushConfig(at="wing"),))
     for how in ({"count": 2}, {"recover": True}, {"controller": "search"}):
         with refused("single-character-only"):
             TrackConfig(push=PushConfig(), **how)  # type: ignore[arg-type]
@@ -161,7 +168,7 @@ def test_what_cannot_be_pushed(task: Imitation, tracker: Tracker) -> None:
     with refused("index-outside", says="90"):
         own = replace(task.task, events=(Push(90, (1.0, 0.0, 0.0), 0, 1),))
         replace(task, task=own).env(1)
-    assert with_push(task, None) is task
+    assert with_forces(task, ()) is task
     assert isinstance(PushConfig(stiffness=50.0).yields, Stiffness)
 
 
@@ -171,7 +178,7 @@ def test_a_toy_body_is_pushed_too() -> None:
     from poise.recipes import ResidualForce, build
 
     task = build(ClipLibrary.of([swing(1.5, name="calm")]), ResidualForce(num_envs=1, expert=False))
-    env = with_push(task, PushConfig(20.0, at="LeftForeArm", start_s=0.1)).env(1, threads=1)
+    env = with_forces(task, (PushConfig(20.0, at="LeftForeArm", start_s=0.1),)).env(1, threads=1)
     env.reset()
     env.step(torch.zeros(1, env.num_actions))
     env.close()

@@ -66,8 +66,8 @@ class Options:
     policy: PolicyFile = None
     model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """A trained in-betweening network; by default the one that comes with Poise."""
-    adapt: Annotated[int, arg(metavar="N")] = 20
-    """Iterations of test-time adaptation for each gap; 0 does without."""
+    adapt: Annotated[int, arg(metavar="N")] = 0
+    """Iterations of test-time adaptation for each gap, such as 20; by default none."""
     hold_feet: HoldFeet = True
     force: Force = False
     json: Json = False

@@ -26,7 +26,7 @@ def run(
     model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
     samples: Annotated[int, arg(metavar="N")] = 1,
     foot_lock: Flag = True,
-    adapt: Annotated[int, arg(metavar="N")] = 20,
+    adapt: Annotated[int, arg(metavar="N")] = 0,
     seed: Annotated[int, arg(metavar="S")] = 0,
     picture: Annotated[Path | None, arg(metavar="FILE.svg", help_behavior_hint="")] = None,
     force: Force = False,
@@ -45,8 +45,8 @@ def run(
             way.
         foot_lock: leave feet as the network made them; by default standing feet are held, and step clear
             of the floor.
-        adapt: iterations of test-time adaptation for each gap, about a second in all: its feet slide
-            less. 0 does without.
+        adapt: iterations of test-time adaptation for each gap, such as 20, about a second in all; by
+            default none.
         seed: seed of the variants.
         picture: also draw the poses, keyframes black, over the clip that came in.
     """

@@ -165,6 +165,14 @@ class Directing:
     """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
     touch: Annotated[Texts, arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
     """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
+    push: Annotated[Texts, arg(metavar="FRAME:PART=NEWTONS[:SECONDS[:X,Y,Z]]")] = ()
+    """Pushes that begin at a frame, such as 30:hand=150, or 30:chest=200:0.3:0,1,0: parts and directions
+    as of poise push, to which the character gives way."""
+    stiffness: Annotated[Texts, arg(metavar="FRAME=N/M")] = ()
+    """From a frame on, give way to pushes as a spring of so many newtons per metre: 30=200."""
+    held: Annotated[Texts, arg(metavar="A-B:HAND=KG[:SIZE]")] = ()
+    """A thing that a hand holds from frame A to B, such as 30-60:right_hand=2.5, a cube of 0.2 m or SIZE
+    that touches nothing."""
     span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
     """Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
     earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
@@ -183,7 +191,9 @@ class Directing:
         from poise.jobs.track.simulation import retake_of
 
         return {
-            "direction": direction_of(self.weight, self.pin, self.touch),
+            "direction": direction_of(
+                self.weight, self.pin, self.touch, self.push, self.stiffness, self.held
+            ),
             "retake": retake_of(self.span, self.earlier),
             "lookahead": lookahead_of(self.budget),
         }

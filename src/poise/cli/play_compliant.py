@@ -21,7 +21,6 @@ from poise.cli.options import (
     check_range,
     lookahead_of,
 )
-from poise.cli.push import direction_of
 from poise.cli.training import working
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.keep import claimed, may_write
@@ -117,13 +116,14 @@ def run(
     for name in RESULTS:
         may_write(out / name, force, *([clip] if clip else []))
     from poise.jobs.open import open_run
+    from poise.jobs.track.pushed import way_of
     from poise.papers.compliant.scene_play import play
     from poise.papers.compliant.scene_training import open_learned, shipped
 
     how = lookahead_of(budget)
     stated: dict[str, Any] = {
         "newtons": newtons,
-        "direction": direction_of(direction),
+        "direction": None if direction is None else way_of(direction),
         "side": side,
         "lead": lead,
         "sway": sway,

@@ -22,7 +22,6 @@ from poise.cli.options import (
     places,
 )
 from poise.cli.training import working
-from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver
 
 
@@ -72,9 +71,10 @@ def run(
         seed: seed of what lookahead draws.
         overwrite: write over files that are there.
     """
-    from poise.jobs.track.pushed import PushConfig
+    from poise.jobs.track.pushed import PushConfig, way_of
 
-    push = PushConfig(newtons, at, start, seconds, direction_of(direction), level, stiffness, law)
+    way = None if direction is None else way_of(direction)
+    push = PushConfig(newtons, at, start, seconds, way, level, stiffness, law)
     check_range("seed", seed, 0)
     check_range("threads", threads, 0)
     folder, motion = places(out)
@@ -121,21 +121,3 @@ def run(
     told = tuple(n for n in (*tracked.notes, *done.notes) if n != tracked.pushed.sentence())
     code, early = LOST if became.failed else 0, tuple(said_early)
     return Answer(result, done.paths, told, code, word, done.card.mpjpe_mm, early)
-
-
-def direction_of(text: str | None) -> tuple[float, float, float] | None:
-    """The numbers of "0,1,0"; None where nothing is stated.
-
-    Raises:
-        PoiseError: these are not three numbers.
-    """
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(v) for v in text.split(","))
-    except ValueError:
-        hint = "Write for example --direction 0,1,0"
-        raise PoiseError(
-            f"--direction needs three numbers, got '{text}'", hint=hint, code="option-malformed"
-        ) from None
-    return x, y, z

@@ -125,6 +125,8 @@ class Stiffness(Checked):
             is, and the goal that it sees lies where a spring of stiffness K would have to pull from,
             displaced by -J^+ f / K. What comes of it yields by K without being told a force.
         weights, root, return_hz, least_n: see `Compliance`; the root stands by default.
+        schedule: other stiffnesses of an episode, `(control step, N/m)` in rising order: each from its
+            step on.
     """
 
     newtons_per_metre: NewtonsPerMetre = 200.0
@@ -135,6 +137,7 @@ class Stiffness(Checked):
     root: bool = False
     return_hz: Positive = 1.0
     least_n: NotNegative = 0.2
+    schedule: tuple[tuple[int, NewtonsPerMetre], ...] = ()
 
     notes = ()
 

@@ -1,4 +1,4 @@
-"""Pushes: one at a stated time, or several at random times."""
+"""Pushes, at a stated time or several at random times, and things that are held."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from poise.env.events import EpisodeStart, Felt, Force, StatedEvent
+from poise.env.events import EpisodeStart, Event, Felt, Force, StatedEvent
 from poise.env.goal import Goal
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_rotate
@@ -32,6 +32,7 @@ class Push(StatedEvent[Goal, Backend], Force, Checked):
         foreseen: whether it begins and ends in this environment by itself. Copies in which a controller
             looks ahead take False: they feel what acts where they were copied, as long as they last,
             and know of no push to come.
+        name: of its own, where a task has several.
     """
 
     row: Annotated[int, Range(0)]
@@ -39,6 +40,7 @@ class Push(StatedEvent[Goal, Backend], Force, Checked):
     first: Annotated[int, Range(0)]
     steps: Count
     foreseen: bool = True
+    name: str = "one push"
 
     def enter(self, goal: Goal, backend: Backend) -> None:
         bodies = len(goal.humanoid.bodies)
@@ -76,11 +78,96 @@ class Push(StatedEvent[Goal, Backend], Force, Checked):
         self._know()
 
     def rows(self) -> dict[str, Tensor]:
-        return {"one push/step": self.step, "one push/acts": self.acts}
+        return {f"{self.name}/step": self.step, f"{self.name}/acts": self.acts}
 
     def _know(self) -> None:
         if self.foreseen:
             self.acts.copy_((self.step >= self.first) & (self.step < self.first + self.steps))
+
+
+@dataclass
+class HeldThing(StatedEvent[Goal, Backend], Event, Checked):
+    """A thing that a body holds for some time of each episode: a cube fixed to it with its middle at the
+    body's inertial centre, which touches nothing; given to `TaskConfig.events`.
+
+    Its mass and its inertia are the body's own while it is held, so that it weighs and resists as a
+    solid does; m / 6 s^2 about each axis for an edge s.
+
+    At work it counts `step` `(N,)`, the control steps of each episode that were made, and keeps `held`
+    `(N,)` bool, the characters that hold it in the next one.
+
+    Attributes:
+        row: of the body table.
+        mass: kg.
+        size: m, the cube's edge.
+        first: the control step of the episode in which it is taken.
+        steps: control steps for which it is held.
+        name: of its own, where a task has several; a body holds one at a time.
+    """
+
+    row: Annotated[int, Range(0)]
+    mass: Positive
+    size: Positive
+    first: Annotated[int, Range(0)]
+    steps: Count
+    name: str = "held thing"
+
+    def enter(self, goal: Goal, backend: Backend) -> None:
+        bodies = len(goal.humanoid.bodies)
+        if self.row >= bodies:
+            raise PoiseError(
+                f"the body has {bodies} parts, there is no row {self.row}",
+                "HeldThing",
+                code="index-outside",
+            )
+        self._backend = backend
+        n, here = backend.num_envs, backend.device
+        self.step = torch.zeros(n, dtype=torch.long, device=here)
+        self.held = torch.zeros(n, dtype=torch.bool, device=here)
+        self._weighs = torch.zeros(n, dtype=torch.bool, device=here)
+        self._mass, self._inertia = backend.expand("body_mass"), backend.expand("body_inertia")
+        self._own = self._mass[:, self.row + 1].clone(), self._inertia[:, self.row + 1].clone()
+        self._know()
+        self._weigh()
+
+    def begin(self, episodes: EpisodeStart) -> None:
+        """Episodes begin before it is taken, unless it is from their first step on."""
+        self.step[episodes.rows] = 0
+        self._know()
+
+    def look(self, ids: Tensor | None) -> None:
+        """Worlds have been set down, or are what a snapshot holds: their hands carry what they held."""
+        self._know()
+        self._weigh()
+
+    def before_step(self, drive: Drive) -> bool:
+        """Puts it into the hand, or takes it out."""
+        self._weigh()
+        return False
+
+    def after_step(self) -> None:
+        """Counts on."""
+        self.step += 1
+        self._know()
+
+    def rows(self) -> dict[str, Tensor]:
+        return {f"{self.name}/step": self.step}
+
+    def _know(self) -> None:
+        self.held.copy_((self.step >= self.first) & (self.step < self.first + self.steps))
+
+    def _weigh(self) -> None:
+        """Gives the bodies the mass that they have with it or without."""
+        changed = (self.held != self._weighs).nonzero().squeeze(-1)
+        if not len(changed):
+            return
+        self._weighs.copy_(self.held)
+        share = self.held[changed].to(self._mass)
+        body, (mass, inertia) = self.row + 1, self._own
+        self._mass[changed, body] = mass[changed] + share * self.mass
+        cube = self.mass * self.size**2 / 6.0
+        self._inertia[changed, body] = inertia[changed] + (share * cube).unsqueeze(1)
+        self._backend.set_const(changed)
 
 
 #: Control steps until a push of an episode that has none.

@@ -192,6 +192,10 @@ class Yielding(Event):
         dial = given.level if isinstance(given, Compliance) else given.newtons_per_metre
         self.level = torch.full((n,), dial, dtype=torch.float64, device=here)
         self.share = torch.ones_like(self.level)
+        scheduled = given.schedule if isinstance(given, Stiffness) else ()
+        self._schedule = torch.tensor([k for k, _ in scheduled], device=here)
+        self._levels = torch.tensor([dial, *(k for _, k in scheduled)]).to(self.level)
+        self.step = torch.zeros(n, dtype=torch.long, device=here)
         self._before, self._k, self._looked = goal.offset.clone(), 0, False
         self._rows = torch.arange(n, device=here).unsqueeze(1)
 
@@ -212,7 +216,8 @@ class Yielding(Event):
         return {"compliance/u": self.goal.offset, "compliance/level": self.level}
 
     def begin(self, episodes: EpisodeStart) -> None:
-        """Draws the levels of new episodes, where they are drawn."""
+        """Draws the levels of new episodes, where they are drawn; a schedule begins anew."""
+        self.step[episodes.rows] = 0
         if isinstance(self.given, Compliance) and self.given.drawn is not None:
             rows = self._rows[:, 0] if episodes.ids is None else episodes.ids
             low, high = self.given.drawn
@@ -220,10 +225,18 @@ class Yielding(Event):
             self.level[rows] = low + (high - low) * drawn.to(self.level.device)
 
     def rows(self) -> dict[str, Tensor]:
-        return {"compliance/level": self.level}
+        own = {"compliance/level": self.level}
+        return {**own, "compliance/step": self.step} if len(self._schedule) else own
+
+    def after_step(self) -> None:
+        """Counts on, for a schedule."""
+        self.step += 1
 
     def before_step(self, drive: Drive) -> bool:
         """A control step begins; what is left of u is nothing once it is too small to be seen."""
+        if len(self._schedule):
+            passed = torch.searchsorted(self._schedule, self.step, right=True)
+            self.level.copy_(self._levels[passed])
         u, rate = self.goal.offset, self.goal.rate
         gone = (u.abs().amax(1, True) < LEAST) & (rate.abs().amax(1, True) < LEAST)
         u.masked_fill_(gone, 0.0)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from poise.env.pushes import HeldThing
 from poise.formats import home_suffix
 from poise.kinematics import anatomy_of, examine, hold_feet, lowest_height, qpos_to_clip, support_of
 from poise.kinematics.feet import stands_higher
@@ -314,6 +315,7 @@ def make_report(
     low = lowest_height(table, r.pos[row, :frames], r.quat[row, :frames]).numpy()
     helped = imitation.config.method != "deepmimic"
     pushed = imitation.task.compliance is not None
+    holds = any(isinstance(e, HeldThing) for e in imitation.task.events)
     return Report(
         title=f"{source.name}, simulated",
         subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and "
@@ -349,7 +351,7 @@ def make_report(
             _lasting(r, other, imitation.library.names[other.clip], frames)
             for other in (evaluation.recordings[1:] if evaluation.together else ())
         ),
-        pushed=pushed,
+        pushed=pushed or holds,
         lost=lost_at(evaluation),
         pushes=recording.contacts if len(recording.contacts) == frames else (),
         things=tuple(

@@ -50,7 +50,7 @@ class TrackConfig:
         supports: "auto" puts boxes where a single motion sits, leans or steps on something
             (`kinematics.supports`), "none" leaves the floor alone; or supports beside the motion that
             comes in.
-        direction: parts that count more, stay put or are touched.
+        direction: parts that count more, stay put or are touched; pushes, and things in hands.
         retake: a part that is simulated anew, while the rest stays as an earlier result has it.
         push: a push in it, to which the character gives way.
         help_limit: N, and N m, that a hand which leads the root may give at most, by inverse dynamics
@@ -115,6 +115,11 @@ class TrackConfig:
         return [name for name, (asked, _) in RULES.items() if asked(self)]
 
     @property
+    def forced(self) -> bool:
+        """Whether something pushes, or is held."""
+        return self.push is not None or self.direction.forces
+
+    @property
     def looks_ahead(self) -> bool:
         """Whether lookahead is wanted."""
         return self.controller in ("auto", "lookahead")
@@ -122,7 +127,7 @@ class TrackConfig:
     @property
     def searches(self) -> bool:
         """Whether what is lost is searched."""
-        single = not (self.recover or self.reset_on_fail or self.count > 1 or self.push)
+        single = not (self.recover or self.reset_on_fail or self.count > 1 or self.forced)
         return self.controller == "search" or (self.controller == "auto" and single)
 
 
@@ -136,9 +141,16 @@ RULES: dict[str, tuple[Callable[[TrackConfig], bool], tuple[str, ...]]] = {
     _COMES: (lambda c: c.recover, (_MANY, _BACK)),
     "a search": (lambda c: c.controller == "search", (_COMES, _BACK, _MANY)),
     "a body of its own": (lambda c: c.body == "own", ()),
-    "weights, pins and touches": (lambda c: bool(c.direction), (_COMES, _MANY)),
+    "weights, pins and touches": (lambda c: c.direction.leads, (_COMES, _MANY)),
     "a range": (lambda c: c.retake is not None, (_COMES, _BACK, _MANY, "noise", "a search")),
-    "a push": (lambda c: c.push is not None, (_COMES, _BACK, _MANY, "noise", "a range", "a search")),
-    "help": (lambda c: c.help_limit > 0, (_COMES, _BACK, _MANY, "a range", "a push")),
+    "a push": (
+        lambda c: c.push is not None or bool(c.direction.pushes),
+        (_COMES, _BACK, _MANY, "noise", "a range", "a search"),
+    ),
+    "a held thing": (
+        lambda c: bool(c.direction.held),
+        (_COMES, _BACK, _MANY, "noise", "a range", "a search"),
+    ),
+    "help": (lambda c: c.help_limit > 0, (_COMES, _BACK, _MANY, "a range", "a push", "a held thing")),
     "a support": (lambda c: isinstance(c.supports, tuple), (_COMES, _MANY)),
 }

@@ -169,7 +169,7 @@ class IkBody:
     heads: point above each neck row.
     rest_pos: `(P, 3)` m and rest_rot: `(R, 3, 3)`, the world at zero angles, root at the origin.
     links: `(R, 3, 3)`, rest rotation in the parent body. axes: `(R, 3, 3)`, the hinges' frame.
-    clusters: points rigidly attached to a trunk row, the row's own first.
+    clusters: points rigidly attached to a trunk row, the row's own first; see `_spanning`.
     normals: `(4, 3)`, the unit axis about which each of `arms` bends, in the rest pose, world.
     trunk: `(3, 3)`, columns left, up and forward in the rest pose.
     """
@@ -250,10 +250,24 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
         rest_rot=rest_rot,
         links=quat_to_matrix(np.array([r.quat for r in rows], dtype=float)),
         axes=axes,
-        clusters={i: (i, *attached(i)) for i in (0, *spine[-1:])},
+        clusters={i: _spanning((i, *attached(i)), rest_pos, roles) for i in (0, *spine[-1:])},
         normals=normals,
         trunk=trunk,
     )
+
+
+#: Points that lie within this share of the shoulders' distance of a line show no turn about it.
+ON_A_LINE = 0.1
+
+
+def _spanning(at: tuple[int, ...], rest: np.ndarray, roles: Mapping[str, int]) -> tuple[int, ...]:
+    """The points of a cluster; with the shoulders where its own lie on a line, as those of a chest do
+    whose collars hang on the neck."""
+    off = rest[list(at)] - rest[at[0]]
+    aside = float(np.linalg.svd(off, compute_uv=False)[1]) if len(at) > 2 else 0.0
+    if aside > ON_A_LINE * float(norm(rest[roles["ls"]] - rest[roles["rs"]])):
+        return at
+    return (*at, *(roles[k] for k in ("ls", "rs") if roles[k] not in at))
 
 
 def _roles(table: BodyTable, spine: tuple[int, ...], toes: Mapping[int, int]) -> dict[str, int]:

@@ -85,6 +85,8 @@ class ScoreCard:
             and that noise (`noise_mm`, `noise_hz`, NaN from frame to frame).
         detail: what is left of the reference's movement at each frequency, of one clip that is tracked.
         changed: its spells that physics changed most: `start_s`, `stop_s`, `body`, `most_mm`.
+        forces: pushes and things in hands of one clip: `kind`, `part`, `force` or `force_n`, when, the
+            body's distance from the motion meanwhile (`error_mm`) and without them (`without_mm`).
         reference: `foot_slide_mm_per_s`, `penetration_mm`, `float_mm`, `jerk` of the reference itself.
         per_clip: each clip's figures, its earliest failure (`first_fail_s`), and of clips one after
             another when each began and ended.
@@ -125,6 +127,7 @@ class ScoreCard:
     raw: Mapping[str, float] = field(default_factory=dict)
     detail: Mapping[str, float] = field(default_factory=dict)
     changed: tuple[Mapping[str, Any], ...] = ()
+    forces: tuple[Mapping[str, Any], ...] = ()
     reference: Mapping[str, float] = field(default_factory=dict)
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
@@ -148,8 +151,9 @@ class ScoreCard:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values with the keys in field order; what is not finite becomes None. `raw`,
-        `detail` and `changed` are left out where they are empty."""
-        return {k: v for k, v in plain(self).items() if v or k not in ("raw", "detail", "changed")}
+        `detail`, `changed` and `forces` are left out where they are empty."""
+        bare = ("raw", "detail", "changed", "forces")
+        return {k: v for k, v in plain(self).items() if v or k not in bare}
 
 
 def write_score(card: ScoreCard, path: str | Path) -> Path:

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from paper_humanoid import body_points, count_jumps, paper_humanoid
 
+import poise
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.formats import read_clip
-from poise.kinematics import IkBody, IkConfig, Kinematics, analytic_ik, clip_ik, clip_to_qpos, ik_body
+from poise.kinematics import (
+    IkBody,
+    IkConfig,
+    Kinematics,
+    analytic_ik,
+    clip_ik,
+    clip_to_qpos,
+    ik_body,
+    qpos_to_clip,
+)
 from poise.motion import Skeleton
 from poise.motion.rotations import normalize, quat_angle, quat_conj, quat_mul, quat_to_matrix
 from refusals import refused
@@ -135,6 +146,18 @@ def test_arms_that_circle_overhead_do_not_jump():
         < 1e-6
     )
     assert count_jumps(q[:, 7:]).sum() == 0
+
+
+def test_collars_that_hang_on_the_neck_do_not_let_the_chest_spin():
+    # Neck and collars in one place show no turn about the line to them; the shoulders do.
+    clip = read_clip(Path(poise.__file__).parent / "data/walk.bvh")
+    body = ik_body(generate_table(clip.skeleton), clip.skeleton)
+    apart = body.rest_pos[body.roles["lcl"]] - body.rest_pos[body.roles["rcl"]]
+    assert np.linalg.norm(apart) < 0.01
+    made = qpos_to_clip(clip_ik(clip, body), body.table, clip.skeleton, clip.fps)
+    turned = quat_angle(quat_mul(quat_conj(made.rot[:-1]), made.rot[1:])) * clip.fps
+    assert turned[:, clip.skeleton.index(body.points[body.chest])].max() < 5.0
+    assert turned.max() < 20.0
 
 
 def test_rotations_decide_what_positions_do_not_show():

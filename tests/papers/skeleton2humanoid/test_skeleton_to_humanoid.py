@@ -1,4 +1,5 @@
-"""Stage III of Skeleton2Humanoid: its state, its curriculum, its baseline, and that it learns."""
+"""The stages of Skeleton2Humanoid; of the third its state, its curriculum, its baseline, and that it
+learns."""
 
 from __future__ import annotations
 
@@ -7,10 +8,23 @@ import pytest
 import torch
 
 from poise.control import LinearHelp
+from poise.env import Reference
 from poise.env import observations as obs
 from poise.env import rewards as reward
+from poise.jobs.inbetween.fill import inbetween
+from poise.kinematics import clip_ik
+from poise.motion import resample, shifted
 from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
-from poise.papers.skeleton2humanoid.recipe import FALLS, INITIAL, LEFT, Budget, build, settings
+from poise.papers.skeleton2humanoid.recipe import (
+    FALLS,
+    INITIAL,
+    LEFT,
+    Budget,
+    build,
+    pipeline,
+    posed,
+    settings,
+)
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force_settings import ResidualForce
 from refusals import refused
@@ -123,3 +137,44 @@ def test_it_learns_and_the_force_becomes_less() -> None:
     assert np.mean(rewards[-3:]) > np.mean(rewards[:3])
     assert trainer.env.help.now == pytest.approx(LEFT / INITIAL, abs=0.1)  # type: ignore[attr-defined]
     trainer.env.close()
+
+
+def test_stage_two_poses_the_body_by_the_places_of_joints_alone() -> None:
+    clip = swing(1.0)
+    twisted = clip.rot.copy()
+    elbow = clip.skeleton.index("LeftForeArm")
+    # A turn about a bone's own axis moves no joint: stage II must not know of it.
+    bone = clip.skeleton.offsets[clip.skeleton.index("LeftHand")]
+    axis = bone / np.linalg.norm(bone)
+    turn = np.array([np.cos(0.3), *(np.sin(0.3) * axis)])
+    twisted[:, elbow] = quat_mul(twisted[:, elbow], np.broadcast_to(turn, twisted[:, elbow].shape))
+    other = clip.replaced(rot=twisted)
+    assert np.abs(other.positions() - clip.positions()).max() < 1e-9
+    one, two = (posed(c).clips[0] for c in (clip, other))
+    np.testing.assert_allclose(one.rot, two.rot, atol=1e-9)
+    np.testing.assert_allclose(one.positions(), clip.positions(), atol=1e-4)
+
+
+def test_stages_are_left_out_one_by_one() -> None:
+    clip, config = swing(1.0), settings(budget=Budget(num_envs=2))
+    clip = shifted(clip, (0.0, 0.0, 0.02))
+    high = build(clip, config, floor=False)
+    # Stage II equals its twin: the analytic inverse kinematics on the very body.
+    qpos = clip_ik(resample(clip, high.reference.rate_hz), high.humanoid)
+    twin = Reference(high.humanoid, [qpos], high.reference.rate_hz, ["twin"]).pose.pos
+    assert float((twin - high.reference.pose.pos).norm(dim=-1).max()) < 1e-4
+    low = build(clip, config).reference.pose.pos
+    lift = (low - high.reference.pose.pos)[..., 2]
+    assert float(lift.abs().max()) > 0.01
+    own = build(clip, config, analytic=False).reference.qpos
+    assert own.shape == build(clip, config).reference.qpos.shape
+
+
+def test_the_pipeline_fills_and_poses() -> None:
+    clip, config = swing(1.0), settings(budget=Budget(num_envs=2))
+    keys = (9, clip.frames - 6)
+    task = pipeline([clip], keys, config, adapt=0, floor=False)
+    filled = inbetween(clip, keys, adapt=0, foot_lock=False).clip
+    rows = [r.joint for r in task.humanoid.table.rows]
+    there = resample(filled, task.reference.rate_hz).positions()[:, rows]
+    np.testing.assert_allclose(task.reference.pose.pos.numpy(), there, atol=1e-3)

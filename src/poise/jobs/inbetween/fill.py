@@ -26,7 +26,7 @@ def inbetween(
     *,
     samples: int = 1,
     foot_lock: bool = True,
-    adapt: int = EACH_GAP.iterations,
+    adapt: int = 0,
     seed: int = 0,
     on_gap: Callable[[int, int], None] | None = None,
 ) -> Result:
@@ -36,7 +36,7 @@ def inbetween(
         keyframes: frames that stay, counted from 0, in rising order.
         model: a trained network, its file or its run folder; by default the one that comes with Poise.
         samples: clips to make. foot_lock: whether feet that stand are held. adapt: iterations of
-            test-time adaptation for each gap, 0 without. seed: of the variants.
+            test-time adaptation for each gap, such as 20. seed: of the variants.
         on_gap: is told how many gaps of how many are made.
 
     Raises:

@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.result import RULE, merit
 from poise.jobs.track.placement import PlacedMotion
-from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
+from poise.jobs.track.pushed import Carried, ForcesSeen, Pushed, unforeseen
 from poise.jobs.track.recovery_run import RecoveryRun, ReplayActions, helped, led_along, look_for, replay
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.track.surroundings import crowd
@@ -67,7 +67,7 @@ class TrackingRun(NamedTuple):
         controller: which did it: "policy", "lookahead" or "search".
         found: what the search came to; None where nothing was searched.
         simulation: the states of the episode, of a single character; None of several.
-        pushed: what came of a push; None without one.
+        forces: what came of each push and held thing.
     """
 
     rollouts: RolloutSet
@@ -77,7 +77,7 @@ class TrackingRun(NamedTuple):
     controller: str
     found: SamplingResult | None = None
     simulation: Simulation | None = None
-    pushed: Pushed | None = None
+    forces: tuple[Pushed | Carried, ...] = ()
 
 
 def done_by(
@@ -108,7 +108,7 @@ def done_by(
             done = episode(imitation, config, ahead, "lookahead", show)
         finally:
             ahead.copies.close()
-        alone = config.count == 1 and config.push is None
+        alone = config.count == 1 and not config.forced
         if alone and not done.failures and loses(tracker, imitation):
             notes.append("The policy alone loses the motion.")
     else:
@@ -235,14 +235,14 @@ def episode(
     told = [] if show is None else [StepProgress(what, int(task.reference.length[0]) - 1, show)]
     # The report shows one character.
     touched, states = ContactForces(), States()
-    push = None if config.push is None else PushSeen()
+    forces = ForcesSeen() if config.forced else None
     observers = [*told, *drawing(show), touched, states] if count == 1 else told
-    observers += [] if push is None else [push]
+    observers += [] if forces is None else [forces]
     rollouts, recordings = run_episodes(
         lambda _: env, keeper or acts, every, starts, config.help_limit, 1, observers
     )
     if count == 1:
-        seen = touched.frames if push is None else push.arrows
+        seen = touched.frames if forces is None else forces.arrows
         recordings[0] = replace(recordings[0], contacts=tuple(seen))
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
@@ -250,8 +250,8 @@ def episode(
     frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
     rate, lost = task.reference.rate_hz, frames[0][1] if frames else None
     kept = states.simulation(task.humanoid, rate, lost) if count == 1 else None
-    came = None if push is None else push.pushed(task.humanoid, rate)
-    return TrackingRun(rollouts, recordings, judged, frames, controller, simulation=kept, pushed=came)
+    came = () if forces is None else forces.came(task.humanoid, rate)
+    return TrackingRun(rollouts, recordings, judged, frames, controller, simulation=kept, forces=came)
 
 
 class StepProgress:

@@ -42,7 +42,7 @@ from poise.jobs.track.placement import (
     place_all,
     points_of,
 )
-from poise.jobs.track.pushed import with_push
+from poise.jobs.track.pushed import ForceEffect, Pushed, with_forces, without_forces
 from poise.jobs.track.rates import rate_doubts, rate_notes
 from poise.jobs.track.recovery_run import RecoveryRun, cut, parts_of, with_parts
 from poise.jobs.track.retaking import as_it_was, retaken, write_simulation
@@ -143,6 +143,7 @@ class TrackSession:
         supports: what the motion rests on.
         led, apart: a character that was led along its motions, and the motions each for itself.
         actor: the policy as it acts in the task, where that is not the tracker.
+        prices: what counts more in each control step, see `Direction.prices`.
         do: how the task is done; by default `done_by`.
         done: how it was done.
     """
@@ -163,6 +164,7 @@ class TrackSession:
     led: RecoveryRun | None = None
     apart: Reference = field(init=False)
     actor: Tracker | None = None
+    prices: torch.Tensor | None = None
     do: Callable[..., tuple[TrackingRun, Sequence[str]]] | None = None
     done: TrackingRun = field(init=False)
     notes: list[str] = field(default_factory=list[str])
@@ -182,13 +184,13 @@ class TrackSession:
         """Simulates and scores."""
         tracker, config, imitation, led = self.tracker, self.config, self.imitation, self.led
         ref, hold = imitation.reference, led.replayed if led else None
-        prices = config.direction.prices(
+        self.prices = config.direction.prices(
             self.given[0], imitation.humanoid.table, ref.frames, ref.rate_hz
         )
         if (draws := draws_of(self.show)) is not None:
             draws.begin(imitation.humanoid, self.placed[0], int(ref.length[0]), ref.rate_hz)
         do = self.do or done_by
-        self.done, said = do(self.actor or tracker, imitation, config, hold, self.show, prices)
+        self.done, said = do(self.actor or tracker, imitation, config, hold, self.show, self.prices)
         notes, about, done = [*self.notes, *said], tracker.about, self.done
         suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
         rollouts = done.rollouts
@@ -311,15 +313,34 @@ def _helped(s: TrackSession, result: Result) -> Result:
     return replace(result, notes=(*result.notes, said))
 
 
-def _push(s: TrackSession) -> None:
-    s.imitation = with_push(s.imitation, s.config.push)
+def _force(s: TrackSession) -> None:
+    """Pushes and held things, at their frames."""
+    fps, rate = s.given[0].fps, s.imitation.reference.rate_hz
+    pushes, held = s.config.direction.forces_of(fps)
+    asked = (*(() if s.config.push is None else (s.config.push,)), *pushes)
+    s.imitation = with_forces(s.imitation, asked, held, s.config.direction.yields(fps, rate))
 
 
-def _pushed(s: TrackSession, result: Result) -> Result:
-    push, came = s.config.push, s.done.pushed
-    assert push is not None and came is not None
-    notes = (*result.notes, came.sentence(), *push.yields.notes, GOAL_YIELDS)
-    return replace(result, notes=notes, pushed=came)
+def _forced(s: TrackSession, result: Result) -> Result:
+    """Sentences on pushes; of those at frames, and of held things, also how near the body is without."""
+    came, law = s.done.forces, s.imitation.task.compliance
+    notes = result.notes
+    if s.config.direction.forces:
+        plain = without_forces(s.imitation)
+        config = replace(s.config, push=None, direction=replace(s.config.direction, pushes=(), held=()))
+        other, _ = (s.do or done_by)(s.actor or s.tracker, plain, config, None, s.show, s.prices)
+        pos, without = result.evaluation.rollouts.pos[0], other.rollouts.pos[0]
+        rate = s.imitation.reference.rate_hz
+        effects = [ForceEffect.between(c, pos, without, s.goals, rate) for c in came]
+        notes = (*notes, *(e.sentence() for e in effects))
+        card = replace(result.evaluation.card, forces=tuple(e.to_dict() for e in effects))
+        result = replace(result, evaluation=replace(result.evaluation, card=card))
+    else:
+        notes = (*notes, *(c.sentence() for c in came))
+    if law is not None:
+        notes = (*notes, *law.notes, GOAL_YIELDS)
+    first = next((c for c in came if isinstance(c, Pushed)), None)
+    return replace(result, notes=notes, pushed=first)
 
 
 def _crowd(s: TrackSession) -> None:
@@ -406,12 +427,12 @@ FEATURES = (
     Feature(lambda _: True, _place),
     Feature(lambda s: not s.leads and s.config.count == 1, _support),
     Feature(lambda s: s.config.help_limit > 0, _help, _helped),
-    Feature(lambda s: s.config.push is not None, _push, _pushed),
+    Feature(lambda s: s.config.forced, _force, _forced),
     Feature(lambda s: s.config.count > 1, _crowd),
     Feature(lambda s: s.leads, _lead, _led),
     Feature(lambda s: s.config.retake is not None, _retake, _retaken),
     Feature(
-        lambda s: not s.several and s.config.push is None and s.config.retake is None,
+        lambda s: not s.several and not s.config.forced and s.config.retake is None,
         finish=_tried_rates,
     ),
     Feature(lambda s: not s.several, finish=_compared),
@@ -508,7 +529,7 @@ def _with_travel(motion: Clip | Keypoints, config: TrackConfig, several: bool) -
     if isinstance(motion, Keypoints):
         return None
     single = config.count == 1 and not config.recover and not several
-    timed = bool(config.direction) or config.push is not None
+    timed = bool(config.direction) or config.forced
     made = with_travel(motion, config.in_place, repeats=single and not timed, returns=single)
     if made is not None and made.overlap is not None and config.retake is not None:
         what = "it is a loop in place, of which several periods were simulated and one is written"

@@ -1,14 +1,15 @@
-"""Skeleton2Humanoid (Li et al., ACM MM 2022), stage III: motion corrected by a policy at test time.
+"""Skeleton2Humanoid (Li et al., ACM MM 2022): three stages, of which each can be left out.
 
-Stage I makes skeleton motion between keyframes and adapts to what it is asked, stage II brings it onto a
-humanoid, stage III lets a policy imitate it with a residual force that becomes less while it learns.
+Stage I makes skeleton motion between keyframes and adapts to what it is asked, stage II brings the
+places of its joints onto a humanoid, stage III lets a policy imitate it with a residual force that
+becomes less while it learns. `pipeline` does I and II and gives the task of III; the floor fit between
+II and III is ours.
 
 | paper                                        | here                                               |
 |----------------------------------------------|----------------------------------------------------|
 | Sec. 3.1 in-betweening (Harvey et al.)       | `jobs.inbetween`, `rtn`, `learn.between`           |
 | Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.inbetween_model`                            |
-| Sec. 3.3, App. A analytic IK                 | `kinematics.ik`, for joints alone; `build`         |
-|                                              | takes a clip's own angles and sets it on the floor |
+| Sec. 3.3, App. A analytic IK                 | `kinematics.clip_ik` by `posed`, in `build`        |
 | Sec. 3.4.1 state with the next two frames    | `env.observations`, `observation="next two"`       |
 | Sec. 3.4.1 action (u_t, eta_t), Eq. 8        | `control.PDTargets`, `control.ImplicitResidual`    |
 | Sec. 3.4.2 curriculum, Eq. 9                 | `control.LinearHelp`                               |
@@ -17,19 +18,29 @@ humanoid, stage III lets a policy imitate it with a residual force that becomes 
 
 A policy of stage III is trained on the very motions that it corrects, one policy for each length of
 transition: it is an optimiser of a set of motions. What needs no training is the universal policy with
-lookahead, without any help: `jobs.complete`.
+lookahead, without any help: `jobs.complete`. There the body takes the network's own rotations, and
+motion that comes in as places alone is posed by `formats.point_fit`: it lies nearer to the places than
+stage II does and is smoother, see `results/papers.csv`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from poise.body import BodyConfig, generate_table
+from poise.env import Reference
 from poise.errors import PoiseError
+from poise.jobs.inbetween.fill import inbetween
+from poise.kinematics import clip_ik, clip_to_qpos, ik_body, qpos_to_clip
+from poise.kinematics.place import on_own_body
 from poise.learn import PPOConfig
-from poise.recipes.imitation import Clips, Imitation
+from poise.motion import Clip, ClipLibrary, resample
+from poise.recipes.imitation import Clips, Imitation, as_library
 from poise.recipes.residual_force import build as imitation_of
 from poise.recipes.residual_force_settings import ResidualForce
+from poise.synthesis.filler import EACH_GAP
 
 #: Eq. 9: S_init in N and N m, what is left of it at i_end, and both iterations of 1,500.
 INITIAL, LEFT, FALLS, ITERATIONS = 220.0, 100.0, (100, 1300), 1500
@@ -103,10 +114,70 @@ def learner(budget: Budget) -> PPOConfig:
     return replace(ppo, policy_hidden=hidden, value_hidden=hidden, horizon=budget.horizon)
 
 
-def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
-    """Body, reference and task of the converted motions; train with `.trainer()`, or as any run of
-    residual forces (`jobs.runs`)."""
-    return imitation_of(clips, config or settings())
+def posed(clips: Clips, body: BodyConfig | None = None) -> ClipLibrary:
+    """Stage II: the same motions with the rotations that the analytic inverse kinematics make of the
+    places of their joints alone.
+
+    Joints without a body of their own (fingers) keep their rotations; hinges that places do not show
+    (wrists, the head where no joint lies above it) are at rest, as in the paper.
+
+    Raises:
+        PoiseError: a skeleton without two arms, two legs and a spine, or places that are not finite.
+    """
+    body = body or ResidualForce().body
+    library, table = on_own_body(as_library(clips), body)
+    first = library.clips[0].skeleton
+    table = table or generate_table(first, body, library.clips)
+    bones = ik_body(table, first)
+    made = (qpos_to_clip(clip_ik(c, bones), table, c.skeleton, c.fps, c, c.name) for c in library)
+    kept = zip(library.clips, made, strict=True)
+    return replace(library, clips=tuple(c.replaced(root_pos=m.root_pos, rot=m.rot) for c, m in kept))
+
+
+def as_came(imitation: Imitation) -> Imitation:
+    """The same task with the motions as they came: no joint slowed down, and not set on the floor."""
+    ref, humanoid = imitation.reference, imitation.humanoid
+    motions = [clip_to_qpos(resample(c, ref.rate_hz), humanoid.table) for c in imitation.library]
+    reference = Reference(humanoid, motions, ref.rate_hz, ref.names, ref.cyclic.tolist())
+    return replace(imitation, reference=reference)
+
+
+def build(
+    clips: Clips, config: ResidualForce | None = None, *, analytic: bool = True, floor: bool = True
+) -> Imitation:
+    """Stage II, and the task of stage III: body and reference of the converted motions; train with
+    `.trainer()`, or as any run of residual forces (`jobs.runs`), which begins with `posed` clips.
+
+    Args:
+        analytic: the angles are those of `posed`; False takes the clips' own.
+        floor: the motions are set on the floor, and joints faster than people's slowed down; the paper
+            does neither.
+    """
+    config = config or settings()
+    made = imitation_of(posed(clips, config.body) if analytic else clips, config)
+    return made if floor else as_came(made)
+
+
+def pipeline(
+    clips: Sequence[Clip],
+    keyframes: Sequence[int],
+    config: ResidualForce | None = None,
+    *,
+    adapt: int = EACH_GAP.iterations,
+    analytic: bool = True,
+    floor: bool = True,
+) -> Imitation:
+    """Stage I of what lies between keyframes of clips, stage II, and the task of stage III.
+
+    Args:
+        keyframes: the same frames of each clip. adapt: iterations of test-time adaptation, 0 without.
+        analytic, floor: see `build`.
+
+    Raises:
+        PoiseError: see `inbetween` and `posed`.
+    """
+    filled = [inbetween(c, keyframes, adapt=adapt, foot_lock=False).clip for c in clips]
+    return build(ClipLibrary.of(filled), config, analytic=analytic, floor=floor)
 
 
 #: See `results/papers.csv`.
