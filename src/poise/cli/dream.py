@@ -22,7 +22,6 @@ from poise.cli.options import (
     lookahead_of,
     places,
 )
-from poise.cli.push import direction_of
 from poise.cli.training import staged, working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver, may_write
@@ -223,6 +222,7 @@ def push_of(text: str) -> DreamPush:
         PoiseError: another word, or a value that makes no sense.
     """
     from poise.jobs.endless.dream_world import DreamPush
+    from poise.jobs.track.pushed import way_of
 
     names = {"force": "newtons", "at": "at", "from": "start_s", "seconds": "seconds",
              "direction": "direction", "every": "every_s"}  # fmt: skip
@@ -241,7 +241,7 @@ def push_of(text: str) -> DreamPush:
             continue
         try:
             if word == "direction":
-                values["direction"] = direction_of(value)
+                values["direction"] = way_of(value)
             elif word == "every":
                 low, _, high = value.partition("-")
                 values["every_s"] = float(low), float(high or low)
