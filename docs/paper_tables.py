@@ -749,8 +749,7 @@ _BALL = PaperTable(
         )
         for name, scene in (
             ("a rod of 1 m", "ball"),
-            ("a rod of 0.9 m (ours alone)", "ball, rod of 0.9 m"),
-            ("a rod of 1.1 m (ours alone)", "ball, rod of 1.1 m"),
+            *((f"a rod of {m:g} m (ours alone)", f"ball, rod of {m:g} m") for m in (0.8, 0.9, 1.1, 1.2)),
             ("pushed with 50 N (ours alone)", "ball, pushed with 50 N"),
             ("pushed with 50 N, another seed (ours alone)", "ball, pushed with 50 N, another seed"),
             ("pushed with 100 N (ours alone)", "ball, pushed with 100 N"),

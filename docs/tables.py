@@ -298,8 +298,8 @@ TABLES: dict[str, Table] = {
             Line("scenes:hand in hand, walking, stiffness 500, lag 0.5 s"),
             Line("scenes:ball, without", "ball on a rod of 1 m, law off"),
             Line("scenes:ball, learned", "ball on a rod of 1 m, learned"),
-            Line("scenes:ball, rod of 0.9 m, learned", "ball on a rod of 0.9 m, learned for 1 m"),
-            Line("scenes:ball, rod of 1.1 m, learned", "ball on a rod of 1.1 m, learned for 1 m"),
+            Line("scenes:ball, rod of 0.8 m, learned", "ball on a rod of 0.8 m, learned for 1 m"),
+            Line("scenes:ball, rod of 1.2 m, learned", "ball on a rod of 1.2 m, learned for 1 m"),
         ),
     ),
     "throws": Table(

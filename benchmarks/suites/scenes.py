@@ -237,8 +237,7 @@ BALL: dict[str, dict[str, Any]] = {
     "ball, pushed with 50 N": {"pushes": 50.0},
     "ball, pushed with 100 N": {"pushes": 100.0},
     "ball, pushed with 50 N, another seed": {"pushes": 50.0, "seed": 1},
-    "ball, rod of 0.9 m": {"length": 0.9},
-    "ball, rod of 1.1 m": {"length": 1.1},
+    **{f"ball, rod of {m:g} m": {"length": m} for m in (0.8, 0.9, 1.1, 1.2)},
 }
 DOORS = {
     f"door {w:g} m{', motion for 1 m' if m else ''}": DoorScene(w, made_for=m)

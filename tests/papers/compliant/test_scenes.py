@@ -246,6 +246,23 @@ def test_what_balancing_sees_and_is_paid() -> None:
     torch.testing.assert_close(seen, torch.tensor(expected), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("length", [0.8, 1.0, 1.2])
+def test_upright_rods_look_alike_whatever_their_length(length: float) -> None:
+    class Seen:
+        sim = SimpleNamespace(
+            pos=torch.tensor([[[0.0, 0.0, 1.5]]]), linvel=torch.zeros(1, 1, 3),
+            heading=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        )  # fmt: skip
+
+        def source(self, name: str) -> Tensor:
+            still = {"rod/pos": [0.0, 0.0, 1.7], "rod/quat": [1.0, 0.0, 0.0, 0.0], "rod/qvel": [0.0] * 6}
+            return torch.tensor([still[name]])
+
+    seen = ball.ball_seen(Seen(), 0, length)[0]  # type: ignore[arg-type]
+    expected = [0.0, 0.0, 1.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.7, 0.0, 0.0, 0.0]
+    torch.testing.assert_close(seen, torch.tensor(expected), atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize("scene", [HandInHand(), PullScene(), DoorScene()])
 def test_a_skeleton_without_hands(task: Imitation, scene: PlayScene) -> None:
     table = task.humanoid.table

@@ -31,6 +31,8 @@ from poise.sim.props import Vector, solid
 
 #: Sharpness of the reward, 1/m^2 (Sec. 5.4).
 SHARPNESS = 2.0
+#: m, the rod's length where nothing else is said.
+USUAL_M = 1.0
 #: m above the head's joint where the rod stands.
 UP_M = 0.2
 #: m by which the rod's middle may be farther from the head when it is put there.
@@ -98,7 +100,7 @@ class Balance:
     rate_hz: ClassVar[float | None] = None
     starts: ClassVar[Spread] = LINKED
 
-    length: Annotated[float, Range(0.1, 5, unit="m")] = 1.0
+    length: Annotated[float, Range(0.1, 5, unit="m")] = USUAL_M
     spread: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.02
     gain: float = GAIN
     damping: float = DAMPING
@@ -259,13 +261,15 @@ def upright_of(sim: SceneSim) -> Tensor:
 
 
 def ball_seen(frame: Frame, head: int, length: float) -> Tensor:
-    """p and v of ball and rod from the head, in the heading's axes `(N, 12)`, m and m/s."""
+    """p and v of ball and rod from the head, in the heading's axes `(N, 12)`, m and m/s; heights as those
+    of a rod of `USUAL_M`, so that a policy knows rods of other lengths, too."""
     pos, quat, qvel = (frame.source(f"rod/{k}") for k in ("pos", "quat", "qvel"))
     arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
     spin, sim = quat_rotate(quat, qvel[:, 3:]), frame.sim
     from_head, moves = pos - sim.pos[:, head], qvel[:, :3] - sim.linvel[:, head]
     turning = torch.linalg.cross(spin, arm)
-    rows = (from_head + arm, moves + turning, from_head + 0.5 * arm, moves + 0.5 * turning)
+    seen = arm - torch.tensor([0.0, 0.0, length - USUAL_M]).to(arm)
+    rows = (from_head + seen, moves + turning, from_head + 0.5 * seen, moves + 0.5 * turning)
     return into_heading(sim.heading, torch.stack(rows, 1)).flatten(1)
 
 
