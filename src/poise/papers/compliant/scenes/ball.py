@@ -261,8 +261,10 @@ def upright_of(sim: SceneSim) -> Tensor:
 
 
 def ball_seen(frame: Frame, head: int, length: float) -> Tensor:
-    """p and v of ball and rod from the head, in the heading's axes `(N, 12)`, m and m/s; heights as those
-    of a rod of `USUAL_M`, so that a policy knows rods of other lengths, too."""
+    """p and v of ball and rod from the head, in the heading's axes `(N, 12)`, m and m/s.
+
+    Heights are those of a rod of `USUAL_M`, so that a policy knows rods of other lengths, too.
+    """
     pos, quat, qvel = (frame.source(f"rod/{k}") for k in ("pos", "quat", "qvel"))
     arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
     spin, sim = quat_rotate(quat, qvel[:, 3:]), frame.sim
