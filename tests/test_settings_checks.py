@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import poise
-from poise.control import Compliance, LinearHelp, PDTargets
+from poise.control import Compliance, LinearHelp, PDTargets, Stiffness
 from poise.env import TaskConfig
 from poise.env.generator_goal import Steering
 from poise.env.pushes import Push, Pushes
@@ -47,6 +47,7 @@ EXAMPLES: dict[type, Any] = {
     Push: Push(0, (0.0, 0.0, 1.0), 0, 1),
     Scene: Scene(()),
     Steering: Steering(((1.0, 1.0),)),
+    Stiffness: Stiffness(schedule=((1, 100.0),)),
     TaskConfig: TaskConfig((), (), (), PDTargets()),
     Throw: Throw("ball", "somebody"),
     Until: Until(iterations=1),

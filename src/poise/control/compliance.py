@@ -137,7 +137,7 @@ class Stiffness(Checked):
     root: bool = False
     return_hz: Positive = 1.0
     least_n: NotNegative = 0.2
-    schedule: tuple[tuple[int, NewtonsPerMetre], ...] = ()
+    schedule: Annotated[tuple[tuple[int, float], ...], STIFFNESS] = ()
 
     notes = ()
 

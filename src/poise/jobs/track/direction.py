@@ -194,7 +194,8 @@ class Direction:
         if not self.stiffness:
             return None
         rising = sorted(self.stiffness, key=lambda s: s.frame)
-        later = tuple((round(s.frame / fps * rate_hz), s.newtons_per_metre) for s in rising[1:])
+        steps = [max(1, round(s.frame / fps * rate_hz)) for s in rising[1:]]
+        later = tuple((k, s.newtons_per_metre) for k, s in zip(steps, rising[1:], strict=True))
         return Stiffness(rising[0].newtons_per_metre, schedule=later)
 
     def applied(self, clip: Clip) -> tuple[Clip, tuple[str, ...]]:
