@@ -18,13 +18,17 @@ import torch
 import poise
 from poise.control import Compliance, LinearHelp, PDTargets, Stiffness
 from poise.env import TaskConfig
-from poise.env.generator_goal import Steering
-from poise.env.pushes import Push, Pushes
+from poise.env.generator_goal import Footprint, Steering
+from poise.env.pushes import HeldThing, Push, Pushes
 from poise.env.recovery.clock import Recovery
+from poise.env.recovery.seats import Seat
 from poise.env.scene_events import Throw
+from poise.env.walk_path import WalkPath
 from poise.errors import PoiseError
+from poise.jobs.endless.dream_world import DreamPush
 from poise.jobs.inbetween.inbetween_settings import Inbetween
-from poise.jobs.track.direction import Weight
+from poise.jobs.track.direction import FrameStiffness, Weight
+from poise.jobs.track.pushed import HeldConfig
 from poise.learn import PPOConfig, Until
 from poise.motion.noise import Drift
 from poise.plan import TeacherConfig
@@ -39,6 +43,10 @@ from refusals import refused
 #: One of each class that cannot be made without arguments, or has no numbers by default.
 EXAMPLES: dict[type, Any] = {
     Compliance: Compliance(joints=(("thigh", 1.0),), drawn=(0.0, 0.1)),
+    DreamPush: DreamPush(every_s=(1.0, 2.0)),
+    FrameStiffness: FrameStiffness(0, 100.0),
+    HeldConfig: HeldConfig("left_hand", 1.0),
+    HeldThing: HeldThing(0, 1.0, 0.2, 0, 1),
     HeightField: HeightField(np.zeros((2, 2)), (1.0, 1.0)),
     LinearHelp: LinearHelp(0, 9),
     Mesh: Mesh(Path(__file__)),
@@ -46,11 +54,13 @@ EXAMPLES: dict[type, Any] = {
     PPOConfig: PPOConfig(smooth_over=(0, 1)),
     Push: Push(0, (0.0, 0.0, 1.0), 0, 1),
     Scene: Scene(()),
+    Seat: Seat(Footprint((1.0, 1.0), (1.0, 1.0)), 0.4),
     Steering: Steering(((1.0, 1.0),)),
     Stiffness: Stiffness(schedule=((1, 100.0),)),
     TaskConfig: TaskConfig((), (), (), PDTargets()),
     Throw: Throw("ball", "somebody"),
     Until: Until(iterations=1),
+    WalkPath: WalkPath(((0.0, 0.0), (1.0, 1.0)), 1.0),
     Weight: Weight("hands", 1.0),
 }
 
