@@ -449,7 +449,17 @@ class Dreamt(Result):
         low = lowest_height(
             humanoid.table, torch.tensor(sim.pos).double(), torch.tensor(sim.quat).double()
         )
-        figures = self.figures["simulated"]
+        figures, error_mm = self.figures["simulated"], np.linalg.norm(apart, axis=-1).mean(-1) * 1000
+        fell = {character for character, _ in self.lost}
+        score = {
+            "kind": "dream",
+            "succ": 1.0 - len(fell) / len(self.characters),
+            "succ_rule": "characters that never fell",
+            "mpjpe_mm": float(error_mm.mean()),
+            "help": self.to_dict()["help"],
+            "foot_slide_mm_per_s": figures["foot_slide_mm_per_s"],
+            "reference": {"foot_slide_mm_per_s": self.figures["asked"]["foot_slide_mm_per_s"]},
+        }
         facts = {
             "length": f"{self.seconds:.1f} s, of which {len(sim.pos) / fps:.0f} s are shown",
             "falls": f"{len(self.lost)}, {self.falls_per_hour:.1f} an hour",
@@ -466,9 +476,9 @@ class Dreamt(Result):
                 for i, b in enumerate(humanoid.table.rows) for g in b.geoms
             ),
             bodies=humanoid.bodies, reference=ref, simulated=sim, fps=fps, force=None, torque=None,
-            error_mm=np.linalg.norm(apart, axis=-1).mean(-1) * 1000,
+            error_mm=error_mm,
             error_global_mm=np.linalg.norm(sim.pos - ref.pos, axis=-1).mean(-1) * 1000,
-            contacts=low[:, list(humanoid.feet)].numpy() < 0.015, score={}, curve={},
+            contacts=low[:, list(humanoid.feet)].numpy() < 0.015, score=score, curve={},
             notes=(self.sentence, *self.notes), facts=facts,
             others=tuple(track(c.done, f"character {k}") for k, c in enumerate(others, 2)),
             things=tuple(

@@ -151,7 +151,9 @@ def sentence(score: dict[str, Any]) -> str:
     """The verdict line, e.g. "Tracks the whole clip from every start: yes (100 %) · joint error …"."""
     track, error, aid, _ = grades(score)
     began = "its first frame" if _only_from_the_first(score) else "every start"
-    return f"{track.name} from {began}: {track.value} · joint error {error.value} · help {aid.value}"
+    # An endless motion has no starts.
+    where = "" if score.get("kind") == "dream" else f" from {began}"
+    return f"{track.name}{where}: {track.value} · joint error {error.value} · help {aid.value}"
 
 
 def cut(score: dict[str, Any]) -> bool:
