@@ -333,7 +333,7 @@ TABLES: dict[str, Table] = {
             Line("dream:policy alone", "`poise dream`, policy alone, twenty minutes"),
             Line("dream:policy alone, ten minutes each", "the same, ten minutes each"),
             Line("dream:lookahead", "`poise dream`, lookahead, three minutes"),
-            Line("live:4 dreaming, 2 cores", "four in real time, looking ahead, two cores, three minutes"),
+            Line("live:4 dreaming, 2 cores", "four in real time, lookahead, two cores, three minutes"),
             Line("dream:its library, as recorded", "the recordings that it learned"),
             Line(
                 "track:an hour of clips in a row, with recovery; policy alone",
