@@ -1,4 +1,4 @@
-"""What papers claim, row by row, beside rows of `results/`, and how a claim ends.
+"""Claims of papers, row by row, beside rows of `results/`, and how a claim ends.
 
 A verdict follows from the rows alone, by `verdict`; nobody writes one. A row that is not there yet is
 "not run", and its figures appear as soon as `results/` has them.

@@ -214,8 +214,8 @@ KINEMATIC = (
 )
 LOOKS = "base + TTA + universal policy with lookahead"
 TWIN = "base + TTA + IK, beside kinematics.clip_ik"
-#: What a policy of all stages goes without, at the longest transition: iterations of adaptation, the
-#: inverse kinematics, the floor.
+#: Stages that a policy of all of them goes without, at the longest transition: iterations of
+#: adaptation, the inverse kinematics, the floor.
 WITHOUT: dict[str, tuple[int, bool, bool]] = {
     "full": (TTA, True, True),
     "full, without adaptation": (0, True, True),
@@ -337,10 +337,19 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
 SEEN = ((0.0, False), (10.0, False), (10.0, True))
 PLACES_SECONDS, PLACES_FPS = 10.0, 30.0
 ROLES = {
-    "hips": "pelvis", "spine": "spine", "neck": "neck", "head": "head", "clavicle": "collar",
-    "upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "thigh": "hip", "shin": "knee",
-    "foot": "ankle", "toes": "toe",
-}  # fmt: skip
+    "hips": "pelvis",
+    "spine": "spine",
+    "neck": "neck",
+    "head": "head",
+    "clavicle": "collar",
+    "upper_arm": "shoulder",
+    "forearm": "elbow",
+    "hand": "wrist",
+    "thigh": "hip",
+    "shin": "knee",
+    "foot": "ankle",
+    "toes": "toe",
+}
 
 
 def clips_of_places(places: Places) -> dict[str, Path]:

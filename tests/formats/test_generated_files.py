@@ -1,4 +1,4 @@
-"""What generators and pose estimators write: joints, Kimodo, HY-Motion, GVHMR, SAM 3D Body."""
+"""Files of generators and pose estimators: joints, Kimodo, HY-Motion, GVHMR, SAM 3D Body."""
 
 from __future__ import annotations
 

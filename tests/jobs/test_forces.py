@@ -47,9 +47,10 @@ def task(tracker: Tracker) -> Imitation:
 
 def test_words_of_forces() -> None:
     made = direction_of(
-        pushes=("30:hand=150", "45:chest=200:0.3:0,1,0"), stiffness=("30=200", "50=900"),
+        pushes=("30:hand=150", "45:chest=200:0.3:0,1,0"),
+        stiffness=("30=200", "50=900"),
         held=("10-40:right_hand=2.5", "41-60:left_hand=1:0.3"),
-    )  # fmt: skip
+    )
     assert made.pushes[0].push == PushConfig(150.0, "hand")
     assert made.pushes[1].push == PushConfig(200.0, "chest", seconds=0.3, direction=(0.0, 1.0, 0.0))
     assert made.forces and not made.leads
@@ -191,9 +192,16 @@ def test_keyframes_with_a_thing_in_a_hand(tracker: Tracker) -> None:
     few = LookaheadConfig().with_budget(40)
     asked = direction_of(held=("15-30:right_hand=1.5",), pushes=("15:chest=40:0.2",))
     done = complete(
-        WALK, (0, 15, 30, 45), tracker, adapt=0, threads=1, lookahead=few, supports="none",
-        controller="lookahead", direction=asked,
-    )  # fmt: skip
+        WALK,
+        (0, 15, 30, 45),
+        tracker,
+        adapt=0,
+        threads=1,
+        lookahead=few,
+        supports="none",
+        controller="lookahead",
+        direction=asked,
+    )
     kinds = [f["kind"] for f in done.evaluation.card.forces]
     assert kinds == ["push", "held"]
     assert any("held 1.5 kg" in note for note in done.notes)

@@ -224,8 +224,14 @@ def push_of(text: str) -> DreamPush:
     from poise.jobs.endless.dream_world import DreamPush
     from poise.jobs.track.pushed import way_of
 
-    names = {"force": "newtons", "at": "at", "from": "start_s", "seconds": "seconds",
-             "direction": "direction", "every": "every_s"}  # fmt: skip
+    names = {
+        "force": "newtons",
+        "at": "at",
+        "from": "start_s",
+        "seconds": "seconds",
+        "direction": "direction",
+        "every": "every_s",
+    }
     values = dict[str, Any]()
     for part in text.split():
         word, equals, value = part.partition("=")
@@ -249,9 +255,11 @@ def push_of(text: str) -> DreamPush:
                 values[names[word]] = float(value)
         except (ValueError, PoiseError):
             raise PoiseError(
-                f"'{part[:40]}' has no number", "--push",
-                "Write for example force=200, every=5-15 or direction=0,1,0", code="option-malformed",
-            ) from None  # fmt: skip
+                f"'{part[:40]}' has no number",
+                "--push",
+                "Write for example force=200, every=5-15 or direction=0,1,0",
+                code="option-malformed",
+            ) from None
     return DreamPush(**values)
 
 

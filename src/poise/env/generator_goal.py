@@ -142,7 +142,7 @@ def cost_of(
 
 
 def path_cost(path: WalkPath, along: Tensor, off: Tensor, first: float, fps: float) -> Tensor:
-    """What futures cost that go along a path, `(K)`.
+    """The costs of futures that go along a path, `(K)`.
 
     Args:
         along, off: `(K, f)` m along it and from it, see `WalkPath.bent`. first: m, where they begin.
@@ -287,7 +287,7 @@ class GeneratorGoal(BufferedGoal):
             one, last, target = slice(row, row + 1), past[row, -1].double(), self._target(world)
             path, begun = self._path(world, last)
             goes = target is not None or path is not None
-            # Where there is somewhere to go, that alone counts, not what the world wishes.
+            # A place to go counts alone, not what the world wishes.
             wishes = None if goes else ids[one]
             others, boxes = self._others(world), self.steering.boxes
             crowded = any(float((o - last[:2]).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
@@ -311,7 +311,7 @@ class GeneratorGoal(BufferedGoal):
         return there and self.steering.target(int(self._passed[world])) is None
 
     def _target(self, world: int) -> Tensor | None:
-        """Where a world is to go next, `(2)` m; None for no place in particular."""
+        """The place that a world is to go to next, `(2)` m; None for no place in particular."""
         led = self.led.get(world)
         return self.steering.target(int(self._passed[world])) if led is None else led
 
@@ -391,8 +391,13 @@ class GeneratorGoal(BufferedGoal):
 
     def rows(self) -> dict[str, Tensor]:
         own = {
-            "passed": self._passed, "did": self._did, "known": self._known, "steps": self.steps,
-            "along": self._along, "known_along": self._known_along, "root": self._root,
-        }  # fmt: skip
+            "passed": self._passed,
+            "did": self._did,
+            "known": self._known,
+            "steps": self.steps,
+            "along": self._along,
+            "known_along": self._known_along,
+            "root": self._root,
+        }
         generator = {f"generator/{k}": v for k, v in self.generator.rows().items()}
         return {**super().rows(), **generator, **own}

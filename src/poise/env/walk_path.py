@@ -126,7 +126,7 @@ class WalkPath:
             cos, sin, d = angle.cos(), angle.sin(), steps[:, t]
             at = at + torch.stack((cos * d[:, 0] - sin * d[:, 1], sin * d[:, 0] + cos * d[:, 1]), -1)
             apart = torch.cdist(at, there)
-            # Where it crosses itself, it is not left for its other branch.
+            # A path that crosses itself is not left for its other branch.
             off, k = apart.masked_fill((tried - here[:, None]).abs() > AHEAD_M, torch.inf).min(1)
             here = tried[k]
             for kept, value in ((places, at), (angles, angle), (alongs, here), (offs, off)):

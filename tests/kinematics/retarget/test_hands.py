@@ -201,7 +201,7 @@ def test_eased_keeps_what_is_slow_and_follows_no_more_than_it_must() -> None:
     slow, quick = np.sin(2 * np.pi * t)[:, None], 0.1 * np.sin(2 * np.pi * 15 * t)[:, None]
     made = eased(slow + quick, np.ones(240), fps, 4.0)
     np.testing.assert_allclose(made[20:-20], slow[20:-20], atol=2e-3)
-    # Where it counts for nothing the path goes on smoothly; where it counts for much it is followed.
+    # A path goes on smoothly in frames that count for nothing, and follows those that count for much.
     weight = np.where(t < 2.0, 1e6, 0.0)
     made = eased(slow + quick, weight, fps, 4.0)
     np.testing.assert_allclose(made[:110], (slow + quick)[:110], atol=1e-3)

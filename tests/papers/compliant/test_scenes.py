@@ -250,9 +250,10 @@ def test_what_balancing_sees_and_is_paid() -> None:
 def test_upright_rods_look_alike_whatever_their_length(length: float) -> None:
     class Seen:
         sim = SimpleNamespace(
-            pos=torch.tensor([[[0.0, 0.0, 1.5]]]), linvel=torch.zeros(1, 1, 3),
+            pos=torch.tensor([[[0.0, 0.0, 1.5]]]),
+            linvel=torch.zeros(1, 1, 3),
             heading=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        )  # fmt: skip
+        )
 
         def source(self, name: str) -> Tensor:
             still = {"rod/pos": [0.0, 0.0, 1.7], "rod/quat": [1.0, 0.0, 0.0, 0.0], "rod/qvel": [0.0] * 6}

@@ -277,7 +277,7 @@ class Visit(NamedTuple):
 
 @dataclass(eq=False)
 class _State:
-    """What a character does about seats: it goes about until `next`; then it goes to a side of a seat,
+    """The visits of a character to seats: it goes about until `next`; then it goes to a side of a seat,
     and gives that up at `until`; `sits` while it follows the planned motion.
 
     at, out: m `(2)`, the place at the edge, and the direction away from it. sat: control steps on it.

@@ -66,11 +66,18 @@ def with_pushes(task: Imitation, pushes: Sequence[DreamPush], seed: int) -> Imit
     rate, never = task.config.sim.control_hz, (math.inf, math.inf)
     events = [
         Pushes(
-            (p.newtons, p.newtons), p.every_s or never, p.seconds, (row_of(task.humanoid.table, p.at),),
-            rate, seed + k, first_s=p.start_s, direction=p.direction, name=f"push {k}",
+            (p.newtons, p.newtons),
+            p.every_s or never,
+            p.seconds,
+            (row_of(task.humanoid.table, p.at),),
+            rate,
+            seed + k,
+            first_s=p.start_s,
+            direction=p.direction,
+            name=f"push {k}",
         )
         for k, p in enumerate(pushes)
-    ]  # fmt: skip
+    ]
     own = replace(task.task, events=(*task.task.events, *events))
     return replace(task, task=own)
 

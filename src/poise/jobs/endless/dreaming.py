@@ -293,7 +293,7 @@ class _Seen:
         return self.stopped()
 
     def help(self, limit: float, mass: float) -> Help:
-        """What a hand gave with up to `limit` N and N m, to characters of `mass` kg."""
+        """The help that a hand gave with up to `limit` N and N m, to characters of `mass` kg."""
         if not self._helped:
             return NO_HELP
         force, torque, goes, spins = torch.stack(self._helped, 1).unbind(0)

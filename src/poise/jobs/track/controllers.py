@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.result import RULE, merit
 from poise.jobs.track.placement import PlacedMotion
-from poise.jobs.track.pushed import Carried, ForcesSeen, Pushed, unforeseen
+from poise.jobs.track.pushed import ForcesSeen, HeldEffect, Pushed, unforeseen
 from poise.jobs.track.recovery_run import RecoveryRun, ReplayActions, helped, led_along, look_for, replay
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.track.surroundings import crowd
@@ -77,7 +77,7 @@ class TrackingRun(NamedTuple):
     controller: str
     found: SamplingResult | None = None
     simulation: Simulation | None = None
-    forces: tuple[Pushed | Carried, ...] = ()
+    forces: tuple[Pushed | HeldEffect, ...] = ()
 
 
 def done_by(

@@ -265,7 +265,7 @@ def direction_of(
     stiffness: Sequence[str] = (),
     held: Sequence[str] = (),
 ) -> Direction:
-    """What words ask for: "hands=3", "head=2:10-40"; "left_foot:12-40"; "right_hand:50:0.3,0.2,1.1";
+    """The direction in words: "hands=3", "head=2:10-40"; "left_foot:12-40"; "right_hand:50:0.3,0.2,1.1";
     "30:hand=150", "30:chest=200:0.3:0,1,0"; "30=200"; "30-60:right_hand=2.5:0.3".
 
     Raises:

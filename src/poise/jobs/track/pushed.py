@@ -143,8 +143,8 @@ class HeldConfig:
 
 
 @dataclass(frozen=True)
-class Carried:
-    """What came of a held thing.
+class HeldEffect:
+    """The effect of a held thing.
 
     Attributes:
         part: the body that held it.
@@ -180,21 +180,25 @@ class ForceEffect:
         without_mm: the same frames of the motion done without any of the forces.
     """
 
-    came: Pushed | Carried
+    came: Pushed | HeldEffect
     error_mm: float
     without_mm: float
 
     @classmethod
     def between(
-        cls, came: Pushed | Carried, pos: Tensor, without: Tensor, goals: Tensor, rate_hz: float
+        cls, came: Pushed | HeldEffect, pos: Tensor, without: Tensor, goals: Tensor, rate_hz: float
     ) -> ForceEffect:
         """Of the bodies' places `(T, B, 3)` m with the forces and without, and where they are to be."""
         first, last = (round(t * rate_hz) for t in (came.first_s, came.last_s + AFTER_S))
         off = [
-            1000 * float((x[first : last + 1] - goals[first : first + len(x[first : last + 1])])
-                         .norm(dim=-1).mean())
+            1000
+            * float(
+                (x[first : last + 1] - goals[first : first + len(x[first : last + 1])])
+                .norm(dim=-1)
+                .mean()
+            )
             for x in (pos, without)
-        ]  # fmt: skip
+        ]
         return cls(came, *off)
 
     def sentence(self) -> str:
@@ -380,13 +384,13 @@ class ForcesSeen:
         self.arrows.append(np.concatenate(rows) if rows else np.zeros((0, 6)))
         return True
 
-    def came(self, humanoid: Humanoid, rate_hz: float) -> tuple[Pushed | Carried, ...]:
-        """What came of each, pushes first."""
+    def came(self, humanoid: Humanoid, rate_hz: float) -> tuple[Pushed | HeldEffect, ...]:
+        """The effect of each, pushes first."""
         return tuple(one.came(humanoid, rate_hz) for one in (*self._pushes, *self._held))
 
 
 class _PushSeen:
-    """What one push does."""
+    """A push as it is recorded."""
 
     def __init__(self, push: Push):
         self._push = push
@@ -408,7 +412,7 @@ class _PushSeen:
         return arrow if acts else arrow[:0]
 
     def came(self, humanoid: Humanoid, rate_hz: float) -> Pushed:
-        """What came of it."""
+        """Its effect."""
         push = self._push
         first = min(push.first, len(self._moved) - 1)
         last = min(push.first + push.steps, len(self._moved) - 1)
@@ -420,7 +424,7 @@ class _PushSeen:
 
 
 class _HeldSeen:
-    """What one held thing pulls with."""
+    """The pull of a held thing as it is recorded."""
 
     def __init__(self, thing: HeldThing):
         self._thing, self._at = thing, list[np.ndarray]()
@@ -432,8 +436,8 @@ class _HeldSeen:
         weight = [*at, 0.0, 0.0, -self._thing.mass * GRAVITY]
         return np.array([weight] if bool(self._thing.held[0]) else []).reshape(-1, 6)
 
-    def came(self, humanoid: Humanoid, rate_hz: float) -> Carried:
-        """What came of it."""
+    def came(self, humanoid: Humanoid, rate_hz: float) -> HeldEffect:
+        """Its effect."""
         thing, at = self._thing, np.array(self._at)
         first = min(thing.first, len(at) - 1)
         last = min(thing.first + thing.steps, len(at) - 1)
@@ -442,4 +446,4 @@ class _HeldSeen:
         pull = thing.mass * np.linalg.norm(faster + np.array([0.0, 0.0, GRAVITY]), axis=-1)
         part = humanoid.bodies[thing.row]
         mean, most = float(pull.mean()), float(pull.max())
-        return Carried(part, thing.mass, first / rate_hz, last / rate_hz, mean, most)
+        return HeldEffect(part, thing.mass, first / rate_hz, last / rate_hz, mean, most)
