@@ -151,7 +151,7 @@ def _sam3d(clip: Clip) -> list[list[dict[str, Any]]]:
     return [[mine(t), other(t)] if t % 3 or not t else [other(t), mine(t)] for t in range(clip.frames)]
 
 
-@pytest.mark.parametrize("form", ["pickle", "torch", "json", "npz", "frames"])
+@pytest.mark.parametrize("form", ["pickle", "torch", "json", "indented", "npz", "frames"])
 def test_sam_3d_body_is_read_in_each_form_that_people_save(tmp_path: Path, form: str) -> None:
     walk = read_clip(WALK)
     frames = _sam3d(walk)
@@ -167,7 +167,8 @@ def test_sam_3d_body_is_read_in_each_form_that_people_save(tmp_path: Path, form:
     else:
         path = tmp_path / "a.json"
         named = [{"frame": f"{t}.jpg", "outputs": f} for t, f in enumerate(plain)]
-        path.write_text(json.dumps(plain if form == "json" else named))
+        text = json.dumps(named if form == "frames" else plain, indent=1 if form == "indented" else None)
+        path.write_text(text, encoding="utf-8-sig" if form == "indented" else "utf-8")
     with refused("rate-missing", says=("--fps",)):
         read_clip(path, allow_pickle=True)
     clip = read_clip(path, fps=30, allow_pickle=True)

@@ -136,7 +136,8 @@ def _people(frame: Any, path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def looks_like_sam3d(head: bytes) -> bool:
     """Whether a file's first bytes are SAM 3D Body's results as JSON."""
-    return head[:1] in (b"[", b"{") and b'"pred_' in head
+    begins = head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+    return begins in (b"[", b"{") and b'"pred_' in head
 
 
 def json_points(path: Path, options: ReadOptions) -> RawPoints:

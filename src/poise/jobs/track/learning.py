@@ -26,13 +26,12 @@ from poise.kinematics.repair.estimate import clean_clip
 from poise.learn import LATEST, PolicyBundle, Until
 from poise.metrics import success_rule
 from poise.motion import Clip, ClipLibrary
+from poise.motion.rotations import GRAVITY
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.score import ClipResults
 from poise.score.rollouts import judge
 
-#: m/s^2, gravity, by which body weight is counted.
-GRAVITY = 9.81
 #: Shares of the body's weight that are tried as help, from the least on.
 SHARES = (0.15, 0.3, 0.6, 1.2, 2.4)
 #: Start frames from which the help is to suffice.

@@ -18,7 +18,7 @@ from poise.env import ImitationEnv
 from poise.env.pushes import HeldThing, Push, Pushes
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.rotations import quat_rotate
+from poise.motion.rotations import GRAVITY, quat_rotate
 from poise.recipes.imitation import Imitation
 from poise.settings import Range, validate
 
@@ -28,8 +28,6 @@ MOST_N = 10_000.0
 MOST_KG = 200.0
 #: s after a force for which the body's distance from the motion counts.
 AFTER_S = 0.5
-#: m/s^2.
-GRAVITY = 9.81
 #: m, how near to the clip a pushed part is back again, and s, for how long it must stay there.
 BACK_M, STAYS_S = 0.1, 0.5
 #: Kinds of the body table by the words for what is pushed.
