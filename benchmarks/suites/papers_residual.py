@@ -181,6 +181,9 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
                 len(own),
                 policy,
             )
+        if policy:
+            subject = f"Residual Force Control, Figure 2, {unit}"
+            yield Figure(subject, "samples", SAMPLES, own[0]["starts"], seeds=len(own), policy=policy)
 
 
 def timed_units(places: Places) -> list[str]:

@@ -6,7 +6,8 @@ on the very motions that they correct, as in the paper; that of poise track is n
 kinematics see places of joints alone; policies correct what they give, set on the floor, and rows of
 their own leave out the adaptation, the inverse kinematics or the floor. FP and FQ are of soles, not of
 joint centres, which lie above the floor in these clips: FQ is the share of feet more than 5 mm below it.
-Help stands beside every row; "base" is the null, which nothing corrects.
+L2P is from the recording set on the floor. Help stands beside every row; "base" is the null, which
+nothing corrects. Errors are standard errors over the windows, each the mean of its seeds.
 
 Places alone also come in from keypoints: there the rotations of the analytic inverse kinematics stand
 beside those of the fit that reads them.
@@ -14,6 +15,7 @@ beside those of the fit that reads them.
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -37,13 +39,24 @@ from poise.formats.landmarks import complete
 from poise.formats.point_fit import JOINT_PLACES, FitConfig, bones_of, fit_clip
 from poise.formats.point_skeleton import hold_lengths, measure, trunk_tracks
 from poise.jobs.inbetween.fill import inbetween
-from poise.jobs.open import open_run
+from poise.jobs.open import open_run, policy_of_run
+from poise.jobs.perpetual.perpetual_run import begin as begin_library
+from poise.jobs.perpetual.perpetual_run import train as train_library
+from poise.jobs.perpetual.stages import Progress
+from poise.jobs.run_file import read_run
 from poise.jobs.runs import begin, evaluate, train, trained_policy
-from poise.jobs.track import track
+from poise.jobs.track import TrackConfig, track
+from poise.jobs.track.learning import helped
+from poise.jobs.track.learning import settings as learning
+from poise.jobs.track.placement import place
+from poise.jobs.track.tracking import with_guide
+from poise.jobs.track_settings import Controller
+from poise.jobs.tracker import Tracker
+from poise.jobs.warm_start import widened
 from poise.kinematics import IkBody, analytic_ik, clip_ik, fit_humanoid, ik_body, qpos_to_clip
-from poise.kinematics.forward import lowest_height
-from poise.learn import Until
-from poise.metrics import l2p
+from poise.kinematics.forward import lowest_height, shapes_of
+from poise.learn import LATEST, Until
+from poise.metrics import foot_points, foot_slide, l2p
 from poise.motion import Clip, ClipLibrary, resample, shifted, trim
 from poise.motion.keypoints import Keypoints
 from poise.motion.roles import find_roles
@@ -115,19 +128,26 @@ def on_joints(clips: list[Clip], joints: list[int]) -> Motion:
     return Motion(pos, quat)
 
 
-def figures(made: Motion, truth: Motion, task: Imitation, std: Tensor, length: int) -> dict[str, float]:
-    """FP, FQ, JQ, SM and L2P of the transitions."""
+def figures(
+    made: Motion, truth: Motion, task: Imitation, std: Tensor, length: int
+) -> dict[str, list[float]]:
+    """FP, FQ, JQ, SM, L2P and slide of each transition."""
     rows = slice(PAST, PAST + length)
-    low = lowest_height(task.humanoid.table, made.pos.double(), made.quat.double())[:, rows]
-    feet = low[..., list(task.humanoid.feet)]
+    table, soles = task.humanoid.table, list(task.humanoid.feet)
+    low = lowest_height(table, made.pos.double(), made.quat.double())[:, rows]
+    feet = low[..., soles]
     moved = torch.diff(made.pos[:, PAST - 1 : PAST + length + 1], dim=1).norm(dim=-1)
-    return {
-        "fp_mm": round(float(1000 * feet.clamp_max(0.0).mean()), 3),
-        "fq_percent": round(100 * float((feet < -THROUGH).double().mean()), 2),
-        "jq_percent": round(100 * float((low < -THROUGH).double().mean()), 2),
-        "sm_mm": round(float(1000 * moved.mean()), 2),
-        "l2p": round(float(l2p(made.pos[:, rows].double(), truth.pos[:, rows].double(), std)), 4),
+    points = foot_points(made.pos[:, rows], made.quat[:, rows], shapes_of(table), soles)
+    pairs = zip(made.pos[:, rows].double(), truth.pos[:, rows].double(), strict=True)
+    each = {
+        "fp_mm": 1000 * feet.clamp_max(0.0).mean((-2, -1)),
+        "fq_percent": 100 * (feet < -THROUGH).double().mean((-2, -1)),
+        "jq_percent": 100 * (low < -THROUGH).double().mean((-2, -1)),
+        "sm_mm": 1000 * moved.mean((-2, -1)),
+        "l2p": torch.stack([l2p(m, t, std) for m, t in pairs]),
+        "slide_mm_per_s": torch.as_tensor(foot_slide(points, FPS)),
     }
+    return {name: [round(float(x), 4) for x in values] for name, values in each.items()}
 
 
 def of_reference(reference: Reference) -> Motion:
@@ -152,7 +172,6 @@ def policy_row(
     task: Imitation, folder: Path, iterations: int, truth: Motion, std: Tensor, length: int
 ) -> dict[str, Any]:
     """A policy trained on the windows, and its figures from each one's first frame."""
-    begun = time.perf_counter()
 
     def told(stats: Any) -> None:
         if round(stats.iteration) % 20 == 0:
@@ -165,41 +184,62 @@ def policy_row(
     r, card = result.rollouts, result.card
     return {
         **figures(Motion(r.pos, r.quat), truth, task, std, length),
-        "succ": round(card.succ, 4),
-        "mpjpe_mm": round(card.mpjpe_mm, 2),
-        "mpjpe_global_mm": round(card.mpjpe_global_mm, 2),
+        "succ": [float(c["succ"]) for c in card.per_clip],
+        "mpjpe_mm": [float(c["mpjpe_mm"]) for c in card.per_clip],
+        "mpjpe_global_mm": [float(c["mpjpe_global_mm"]) for c in card.per_clip],
         "limit_n": round(float(meta["help_limit"]), 1),
         "force_mean_n": round(card.help.force_mean_n, 2),
         "torque_mean_nm": round(card.help.torque_mean_nm, 2),
         "samples": int(meta["samples"]),
-        "minutes": round((time.perf_counter() - begun) / 60, 1),
     }
 
 
 def tracked_row(
-    clips: list[Clip], joints: list[int], task: Imitation, truth: Motion, std: Tensor, length: int
+    clips: list[Clip],
+    tracker: Tracker,
+    controller: Controller,
+    b: Bench,
+    length: int,
 ) -> dict[str, Any]:
-    """The policy that comes with Poise, with lookahead, on the same motions; no help."""
-    run, begun = open_run(None), time.perf_counter()
-    done = [track(c, run, threads=1, supports="none") for c in clips]
-    took = time.perf_counter() - begun
+    """A universal policy on the same motions; no help."""
+    how = TrackConfig(controller=controller, threads=1, supports="none")
+    done = [track(c, tracker, how) for c in clips]
     frames = clips[0].frames
     # On the floor that it was simulated on: what is written is as high as the source again.
-    made = on_joints([trim(d.at_home(d.motion(), False), 0, frames - 1) for d in done], joints)
+    made = on_joints([trim(d.at_home(d.motion(), False), 0, frames - 1) for d in done], b.joints)
     return {
-        **figures(made, truth, task, std, length),
-        "succ": sum(not d.failures for d in done) / len(done),
-        "mpjpe_mm": round(sum(d.card.mpjpe_mm for d in done) / len(done), 2),
-        "mpjpe_global_mm": round(sum(d.card.mpjpe_global_mm for d in done) / len(done), 2),
+        **figures(made, b.truth, b.task, b.std, length),
+        "succ": [float(not d.failures) for d in done],
+        "mpjpe_mm": [d.card.mpjpe_mm for d in done],
+        "mpjpe_global_mm": [d.card.mpjpe_global_mm for d in done],
         "force_mean_n": 0.0,
         "torque_mean_nm": 0.0,
-        "samples": 0,
-        "minutes": round(took / 60, 1),
-        "policy": digest_of(run.tracker.policy),
     }
 
 
-COUNT, ITERATIONS = 32, 60
+def learned_on(clips: list[Clip], folder: Path, samples: int, seed: int) -> tuple[Tracker, int]:
+    """The policy that ships, trained on the windows with a residual force that fades to none, on the
+    windows' own bones, and its samples."""
+    tracker = open_run(None).tracker.with_bones_of(clips[0])
+    placed = [place(c, tracker) for c in clips]
+    config = helped(replace(learning(tracker.config, seed), num_envs=512), HELP_N)
+    clips = [p.clip.replaced(name=f"{k}-{p.clip.name}", cyclic=False) for k, p in enumerate(placed)]
+    task = begin_library(folder, ClipLibrary.of(clips), config, "windows", "cpu", tracker)
+    motions, names = [p.qpos for p in placed], task.library.names
+    reference = Reference(task.humanoid, motions, config.sim.control_hz, names)
+    task = with_guide(replace(task, reference=reference))
+    trained = None if (folder / LATEST).exists() else widened(tracker, task, 0)
+
+    def told(progress: Progress) -> None:
+        if progress.iteration % 20 == 0:
+            print(f"{folder.name}: {progress.share:.0%}, {progress.succeeded} done", flush=True)
+
+    train_library(task, folder, Until(samples=samples), told, 1, False, trained=trained)
+    made = replace(policy_of_run(read_run(folder)), onto=tracker.onto)
+    return made, int(made.about["samples"])
+
+
+COUNT, ITERATIONS, SEEDS = 32, 60, (0, 1)
 LENGTHS = (5, 15, 30)
 TTA = 20
 KINEMATIC = (
@@ -211,9 +251,13 @@ KINEMATIC = (
     "base + TTA + IK",
     "base + TTA + IK + set on the floor",
     "base + TTA + set on the floor",
+    "base + set on the floor",
 )
 LOOKS = "base + TTA + universal policy with lookahead"
 TWIN = "base + TTA + IK, beside kinematics.clip_ik"
+#: The universal policy that goes on on the windows, N and N m of help that fades from there to none,
+#: and control steps of each length.
+ONWARD, HELP_N, ONWARD_SAMPLES = "from the tracker", 100.0, 1_500_000
 #: Stages that a policy of all of them goes without, at the longest transition: iterations of
 #: adaptation, the inverse kinematics, the floor.
 WITHOUT: dict[str, tuple[int, bool, bool]] = {
@@ -240,11 +284,13 @@ def bench(places: Places, length: int) -> Bench:
     """Windows, transitions after adaptation, and the task on them."""
     test = toys(length) if places.smoke else windows(places.data, length, COUNT)
     adapted = filled(test.truth, length, 1 if places.smoke else TTA)
-    task = build(ClipLibrary.of(adapted), settings("full", budget(places)))
+    config = settings("full", budget(places))
+    task = build(ClipLibrary.of(adapted), config)
     joints = [r.joint for r in task.humanoid.table.rows]
     names = task.humanoid.skeleton.names
     std = torch.stack([test.std[names[j]] for j in joints])
-    return Bench(test, adapted, task, joints, std, on_joints(test.truth, joints))
+    truth = build(ClipLibrary.of(test.truth), config, analytic=False).reference
+    return Bench(test, adapted, task, joints, std, of_reference(truth))
 
 
 def toys(length: int) -> Set:
@@ -260,12 +306,13 @@ def budget(places: Places) -> Budget:
 
 
 def units(places: Places) -> list[str]:
-    """Lengths and policies."""
+    """Lengths, policies and seeds, by what they tell."""
     if places.smoke:
-        return ["5 frames; full, seed 0", "5 frames; full, without the floor, seed 0"]
-    rows = [f"{n} frames; {LOOKS}" for n in LENGTHS]
-    rows += [f"{n} frames; {v}, seed {s}" for n in LENGTHS for v in VARIANTS for s in (0, 1)]
-    return rows + [f"{LENGTHS[-1]} frames; {v}, seed 0" for v in WITHOUT if v not in VARIANTS]
+        return [f"5 frames; {k}, seed 0" for k in ("full", "full, without the floor", ONWARD)]
+    out = [f"{n} frames; {LOOKS}" for n in LENGTHS]
+    out += [f"{n} frames; {v}, seed {s}" for s in SEEDS for v in (ONWARD, "full") for n in LENGTHS]
+    kinds = [v for v in (*VARIANTS, *WITHOUT) if v != "full"]
+    return out + [f"{LENGTHS[-1]} frames; {v}, seed {s}" for s in SEEDS for v in kinds]
 
 
 def corrected(places: Places, unit: str) -> Any:
@@ -274,15 +321,20 @@ def corrected(places: Places, unit: str) -> Any:
     n = int(what.split()[0])
     b = bench(places, n)
     if kind == LOOKS:
-        return tracked_row(b.adapted, b.joints, b.task, b.truth, b.std, n)
+        tracker = open_run(None).tracker
+        return tracked_row(b.adapted, tracker, "auto", b, n) | {"policy": digest_of(tracker.policy)}
     variant, _, seed = kind.partition(", seed ")
+    folder = places.work / "s2h" / f"{n}-{re.sub('[^a-z]+', '-', variant)}-{seed}"
+    if variant == ONWARD:
+        asked = 64 if places.smoke else ONWARD_SAMPLES
+        tracker, samples = learned_on(b.adapted, folder, asked, int(seed))
+        return tracked_row(b.adapted, tracker, "policy", b, n) | {"samples": samples}
     adapt, analytic, floor = WITHOUT.get(variant, WITHOUT["full"])
     own = settings("full" if variant in WITHOUT else variant, budget(places), seed=int(seed))  # type: ignore[arg-type]
     if places.smoke:
         own = replace(
             own, ppo=replace(own.ppo, minibatch=16, norm_warmup=2, policy_hidden=(8,)), expert=False
         )
-    folder = places.work / "s2h" / f"{n}-{re.sub('[^a-z]+', '-', variant)}-{seed}"
     clips = ClipLibrary.of(b.adapted if adapt else filled(b.test.truth, n, 0))
     task = begin(folder, posed(clips) if analytic else clips, own)
     task = task if floor else as_came(task)
@@ -307,28 +359,42 @@ def staged(places: Places, unit: str) -> Any:
         high = as_came(b.task)
         return apart_mm(of_reference(high.reference), twin(b.adapted, high))
     made: dict[str, Callable[[], Motion]] = {
-        "recorded": lambda: b.truth,
-        "recorded, set on the floor": lambda: converted(b.test.truth, analytic=False),
+        "recorded": lambda: on_joints(b.test.truth, b.joints),
+        "recorded, set on the floor": lambda: b.truth,
         "base": lambda: on_joints(filled(b.test.truth, n, 0), b.joints),
         "base + TTA": lambda: on_joints(b.adapted, b.joints),
         "base + IK": lambda: converted(filled(b.test.truth, n, 0), floor=False),
         "base + TTA + IK": lambda: of_reference(as_came(b.task).reference),
         "base + TTA + IK + set on the floor": lambda: of_reference(b.task.reference),
         "base + TTA + set on the floor": lambda: converted(b.adapted, analytic=False),
+        "base + set on the floor": lambda: converted(filled(b.test.truth, n, 0), analytic=False),
     }
     return figures(made[kind](), b.truth, b.task, b.std, n)
 
 
 def rows(places: Places, raws: Raws) -> Iterator[Figure]:
-    """Each stage."""
+    """Each stage: the mean of its windows with its standard error, a window the mean of its seeds."""
+    groups: dict[str, list[dict[str, Any]]] = {}
     for unit, raw in raws.items():
+        groups.setdefault(unit.partition(", seed ")[0], []).append(raw)
+    for unit, own in groups.items():
         kind = unit.partition("; ")[2]
         policy = stated(("inbetween",)) if "base" in kind else ""
         policy = stated(("inbetween", "tracker")) if kind == LOOKS else policy
-        if ", seed " in kind:
-            policy = f"{kind.rpartition(', seed')[0]} (trained for this table)"
-        values = {k: v for k, v in raw.items() if k not in ("samples", "minutes", "policy")}
-        yield from of(f"Skeleton2Humanoid, {unit}", values, 2 if places.smoke else COUNT, policy=policy)
+        if "samples" in own[0]:
+            policy = f"{kind} (trained for this table)"
+        for key in own[0].keys() - {"policy"}:
+            values = np.mean([r[key] for r in own], axis=0)
+            error = values.std(ddof=1) / math.sqrt(len(values)) if values.ndim else math.nan
+            yield Figure(
+                f"Skeleton2Humanoid, {unit}",
+                key,
+                float(values.mean()),
+                values.size if values.ndim else len(own[0]["l2p"]) if "l2p" in own[0] else COUNT,
+                f"+- {error:.2g}" if values.ndim else "",
+                len(own),
+                policy,
+            )
 
 
 # --- places alone -----------------------------------------------------------------------------------
