@@ -82,9 +82,19 @@ def _curves() -> tuple[Claim, ...]:
             over=every,
             printed="no row",
         ),
-        Claim("samples to DeepMimic's end, RFC-Explicit", says="better", beside="DeepMimic", run=""),
-        Claim("samples to DeepMimic's end, RFC-Implicit", says="better", beside="DeepMimic", run=""),
-        Claim("gains by 0.5 and 2 (App. C)", says="alike", beside="the usual gains", run=""),
+        *(
+            Claim(
+                f"gains by {factor} (App. C)",
+                _curve(f"rfc-implicit, gains by {factor}"),
+                "alike",
+                _curve("rfc-implicit"),
+                "the usual gains",
+                judged=reward,
+                over=every,
+                printed="in words",
+            )
+            for factor in ("0.5", "2")
+        ),
     ]
     return tuple(out)
 
@@ -96,6 +106,23 @@ _FIGURE_2 = PaperTable(
         Measure("success", "succ", "%"),
     ),
     _curves(),
+    f"{_PAPERS} 'residual forces'",
+    "Residual Force Control, Figure 2; any policy",
+    "a curve",
+)
+_SOONER = PaperTable(
+    (Measure("control steps, thousand", "thousand_to_deepmimic", "0", -1),),
+    tuple(
+        Claim(
+            f"all clips, {name}",
+            _curve(method),
+            "better",
+            _curve("deepmimic"),
+            "DeepMimic",
+            over=tuple(_AGILE),
+        )
+        for method, name in (("rfc-explicit", "RFC-Explicit"), ("rfc-implicit", "RFC-Implicit"))
+    ),
     f"{_PAPERS} 'residual forces'",
     "Residual Force Control, Figure 2; any policy",
     "a curve",
@@ -119,21 +146,25 @@ _ALONE = PaperTable(
     ),
     printed="a video, with force",
 )
+_ONE = "papers:Residual Force Control, App. C, one character; {}"
 _TIMES = PaperTable(
-    (Measure("ms a step", "ms_a_step", "1", -1),),
+    (Measure("ms a step", "ms_a_step", "2", -1),),
     tuple(
         Claim(
             name,
-            says=says,
-            beside="no residual force" if says else "",
-            paper=f"Residual Force Control, App. C; {name}",
+            _ONE.format(method),
+            says,
+            _ONE.format("deepmimic") if says else "",
+            "no residual force" if says else "",
+            f"Residual Force Control, App. C; {name}",
         )
-        for name, says in (
-            ("no residual force", ""),
-            ("RFC-Explicit", "worse"),
-            ("RFC-Implicit", "worse"),
+        for name, method, says in (
+            ("no residual force", "deepmimic", ""),
+            ("RFC-Explicit", "rfc-explicit", "worse"),
+            ("RFC-Implicit", "rfc-implicit", "worse"),
         )
     ),
+    f"{_PAPERS} 'residual times'",
 )
 
 
@@ -254,6 +285,7 @@ _GAPS = (
     Measure("JQ, %", "jq_percent", "1", -1, 100.0),
     Measure("SM, mm", "sm_mm", "1", -1),
     Measure("L2P", "l2p", "2", -1),
+    Measure("slide, mm/s", "slide_mm_per_s", "0", -1),
 )
 
 
@@ -280,7 +312,7 @@ def _stages() -> tuple[Claim, ...]:
             ("baseline w/ TTA, IK", "base + TTA + IK", "worse", "base + TTA", "TTA", worse),
             (
                 "baseline w/ TTA, IK, CRP",
-                "full, seed *",
+                "full",
                 "better",
                 "base",
                 "the baseline, L2P worse",
@@ -292,6 +324,7 @@ def _stages() -> tuple[Claim, ...]:
 
 
 _S2H_1 = PaperTable(_GAPS, _stages(), _SKELETON, "Skeleton2Humanoid, Table 4; any policy")
+_PHYSICS = ("fp_mm", "fq_percent", "jq_percent", "slide_mm_per_s")
 _S2H_1_OURS = PaperTable(
     _GAPS,
     tuple(
@@ -299,30 +332,43 @@ _S2H_1_OURS = PaperTable(
         for name, ours, says, than, judged in (
             ("recorded", "recorded", "", "", ()),
             ("recorded, set on the floor", "recorded, set on the floor", "", "", ()),
+            ("baseline, set on the floor", "base + set on the floor", "better", "base", _PHYSICS),
             ("IK without TTA", "base + IK", "", "", ()),
-            (
-                "TTA, set on the floor",
-                "base + TTA + set on the floor",
-                "better",
-                "base + TTA",
-                ("fp_mm", "fq_percent", "jq_percent"),
-            ),
+            ("TTA, set on the floor", "base + TTA + set on the floor", "better", "base + TTA", _PHYSICS),
             (
                 "TTA, IK, set on the floor",
                 "base + TTA + IK + set on the floor",
                 "better",
                 "base + TTA + IK",
-                ("fp_mm", "fq_percent", "jq_percent"),
+                _PHYSICS,
             ),
             (
                 "TTA, `poise track` (no help, not trained on it)",
                 "base + TTA + universal policy with lookahead",
                 "better",
                 "base",
-                ("fp_mm", "fq_percent", "jq_percent", "-l2p"),
+                (*_PHYSICS, "-l2p"),
+            ),
+            (
+                "TTA, the universal policy trained on it (help to none)",
+                "from the tracker",
+                "better",
+                "base",
+                (*_PHYSICS, "-l2p"),
             ),
         )
         for n in _LENGTHS
+    )
+    + tuple(
+        Claim(
+            f"{title}, 30 frames",
+            _stage(f"full, {title}", 30),
+            "worse",
+            _stage("full", 30),
+            "all stages",
+            judged=(*_PHYSICS, "l2p"),
+        )
+        for title in ("without adaptation", "without inverse kinematics", "without the floor")
     ),
     _SKELETON,
     printed="no row",
@@ -332,13 +378,16 @@ _S2H_2 = PaperTable(
     tuple(
         Claim(
             f"{name}, {n} frames",
-            says=says,
-            beside="the baseline" if says else "",
-            paper=f"Skeleton2Humanoid, Table 2, {n} frames; {name}",
+            _stage(ours, n),
+            says,
+            _stage("base", n) if says else "",
+            "the baseline" if says else "",
+            f"Skeleton2Humanoid, Table 2, {n} frames; {name}",
         )
-        for name, says in (("baseline", ""), ("baseline w/ TTA", "better"))
+        for name, ours, says in (("baseline", "base", ""), ("baseline w/ TTA", "base + TTA", "better"))
         for n in _LENGTHS
     ),
+    f"{_PAPERS} skeleton-stages",
 )
 _TAKES = "inbetween-complete:Bandai, other takes of what was learned; {}"
 _ACCURACY = tuple(
@@ -414,35 +463,36 @@ _IMITATED_GAPS = (
 
 
 def _corrections() -> tuple[Claim, ...]:
-    out = list[Claim]()
-    for frames, more in ((_stage, ""), (_stage_before, ", network of 22 November")):
-        for name, variant in (
-            ("UHC", "uhc"),
-            ("CRP w/o TwoFrameFeats", "one frame"),
-            ("CRP w/o CurForce", "no curriculum"),
-            ("CRP", "full"),
-        ):
-            whole = variant == "full"
-            out.append(
-                Claim(
-                    f"{name}{more}",
-                    frames(f"{variant}, seed *", 30),
-                    "" if whole else "worse",
-                    "" if whole else frames("full, seed *", 30),
-                    "CRP",
-                    f"Skeleton2Humanoid, Table 4; {name}",
-                    ("l2p", "mpjpe_mm"),
-                    optional=bool(more),
-                )
+    whole, both = _stage("full", 30), ("l2p", "mpjpe_mm")
+    return (
+        *(
+            Claim(
+                name,
+                _stage(variant, 30),
+                "worse",
+                whole,
+                "CRP",
+                f"Skeleton2Humanoid, Table 4; {name}",
+                both,
             )
-        zero = frames("full to zero, seed *", 30)
-        row = f"CRP to no force (ours alone){more}"
-        out.append(Claim(row, zero, printed="no row", optional=bool(more)))
-    return tuple(out)
-
-
-def _stage_before(stage: str, length: int) -> str:
-    return f"papers:Skeleton2Humanoid, {length}, the network of 22 November frames; {stage}"
+            for name, variant in (
+                ("UHC", "uhc"),
+                ("CRP w/o TwoFrameFeats", "one frame"),
+                ("CRP w/o CurForce", "no curriculum"),
+            )
+        ),
+        Claim("CRP", whole, paper="Skeleton2Humanoid, Table 4; CRP"),
+        Claim("CRP to no force (ours alone)", _stage("full to zero", 30), printed="no row"),
+        Claim(
+            "from the tracker to no force (ours alone)",
+            _stage("from the tracker", 30),
+            "better",
+            whole,
+            "CRP",
+            judged=both,
+            printed="no row",
+        ),
+    )
 
 
 _S2H_4 = PaperTable(_IMITATED_GAPS, _corrections(), _SKELETON, "Skeleton2Humanoid, Table 4; any policy")
@@ -464,13 +514,30 @@ _S2H_IK = PaperTable(
     _SKELETON,
 )
 _ITERATIONS = ("baseline", *(f"iteration {k}" for k in range(1, 8)))
+_ADAPTATION = "papers:Skeleton2Humanoid, adaptation; "
+_ITERATED = f"{_PAPERS} skeleton-iterations"
 _S2H_5 = PaperTable(
     (*_ACCURACY[3:], *_ACCURACY[:3]),
-    tuple(Claim(name, paper=f"Skeleton2Humanoid, Table 5; {name}") for name in _ITERATIONS),
+    tuple(
+        Claim(
+            name,
+            _ADAPTATION + name,
+            says,
+            _ADAPTATION + "baseline" if says else "",
+            "the baseline" if says else "",
+            f"Skeleton2Humanoid, Table 5; {name}",
+        )
+        for name, says in zip(_ITERATIONS, ("", *("better",) * 7), strict=True)
+    ),
+    _ITERATED,
 )
 _S2H_6 = PaperTable(
-    tuple(Measure(f"ms at {n}", f"ms_{n}", "2", -1) for n in _LENGTHS),
-    tuple(Claim(name, paper=f"Skeleton2Humanoid, Table 6; {name}") for name in _ITERATIONS),
+    tuple(Measure(f"ms at {n}", f"ms_{n}", "1", -1) for n in _LENGTHS),
+    tuple(
+        Claim(name, _ADAPTATION + name, paper=f"Skeleton2Humanoid, Table 6; {name}")
+        for name in _ITERATIONS
+    ),
+    _ITERATED,
 )
 
 # --- Deep Compliant Control -------------------------------------------------------------------------
@@ -1016,6 +1083,7 @@ _PHC_LIVE = PaperTable(
 
 PAPER_TABLES: dict[str, PaperTable] = {
     "rfc-figure-2": _FIGURE_2,
+    "rfc-samples": _SOONER,
     "rfc-clips": _ALONE,
     "rfc-times": _TIMES,
     "rfc-table-1": _TABLE_1,

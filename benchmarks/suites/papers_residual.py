@@ -168,7 +168,7 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
             end = statistics.fmean(r["return_last"] for r in against)
             for raw in own:
                 first = [s for s, value in raw["curve"] if value >= end]
-                raw["samples_to_deepmimic"] = (first or [raw["curve"][-1][0]])[0]
+                raw["thousand_to_deepmimic"] = (first or [raw["curve"][-1][0]])[0] / 1000
         policy = "" if kind == "nothing" else f"{kind} (trained for this table)"
         for key in own[0].keys() - {"starts", "curve"}:
             values = [float(r[key]) for r in own]

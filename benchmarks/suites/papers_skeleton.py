@@ -56,7 +56,7 @@ from poise.jobs.warm_start import widened
 from poise.kinematics import IkBody, analytic_ik, clip_ik, fit_humanoid, ik_body, qpos_to_clip
 from poise.kinematics.forward import lowest_height, shapes_of
 from poise.learn import LATEST, Until
-from poise.metrics import foot_points, foot_slide, l2p
+from poise.metrics import foot_points, foot_slide, l2p, l2q
 from poise.motion import Clip, ClipLibrary, resample, shifted, trim
 from poise.motion.keypoints import Keypoints
 from poise.motion.roles import find_roles
@@ -372,6 +372,53 @@ def staged(places: Places, unit: str) -> Any:
     return figures(made[kind](), b.truth, b.task, b.std, n)
 
 
+#: Iterations of adaptation of Tables 5 and 6.
+ITERATED = range(8)
+
+
+def iterated_units(places: Places) -> list[str]:
+    """Lengths and iterations."""
+    some = (5,) if places.smoke else LENGTHS
+    return [
+        f"{n} frames; {k} iterations" for n in some for k in (ITERATED[:2] if places.smoke else ITERATED)
+    ]
+
+
+def iterated(places: Places, unit: str) -> Any:
+    """L2P and L2Q of each transition after so much adaptation, and ms of them all, each."""
+    n, k = map(int, re.findall(r"\d+", unit))
+    b = bench(places, n)
+    filled(b.test.truth[:1], n, k)
+    begun = time.process_time()
+    made = on_joints(filled(b.test.truth, n, k), b.joints)
+    spent = 1000 * (time.process_time() - begun) / len(b.test.truth)
+    truth, gap = on_joints(b.test.truth, b.joints), slice(PAST, PAST + n)
+    pairs = [(m[gap], t[gap]) for m, t in zip(made.pos, truth.pos, strict=True)]
+    # Both turns that are the same rotation count as one.
+    same = (made.quat * truth.quat).sum(-1, keepdim=True) >= 0
+    turned = torch.where(same, made.quat, -made.quat)
+    turns = [(m[gap], t[gap]) for m, t in zip(turned, truth.quat, strict=True)]
+    return {
+        "l2p": [float(l2p(m.double(), t.double(), b.std)) for m, t in pairs],
+        "l2q": [float(l2q(m, t)) for m, t in turns],
+        "ms": spent,
+    }
+
+
+def iterated_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """By iterations, the metrics of each length; times of iterations are beyond the network's own."""
+    policy = stated(("inbetween",))
+    for unit, raw in raws.items():
+        n, k = map(int, re.findall(r"\d+", unit))
+        subject = "Skeleton2Humanoid, adaptation; " + (f"iteration {k}" if k else "baseline")
+        for key in ("l2p", "l2q"):
+            values = np.array(raw[key])
+            error = f"+- {values.std(ddof=1) / math.sqrt(len(values)):.2g}"
+            yield Figure(subject, f"{key}_{n}", values.mean(), len(values), error, policy=policy)
+        ms = raw["ms"] - (raws[f"{n} frames; 0 iterations"]["ms"] if k else 0.0)
+        yield Figure(subject, f"ms_{n}", ms, len(raw["l2p"]), policy=policy)
+
+
 def rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Each stage: the mean of its windows with its standard error, a window the mean of its seeds."""
     groups: dict[str, list[dict[str, Any]]] = {}
@@ -539,6 +586,9 @@ PARTS = {
     "skeleton": Part("Skeleton2Humanoid, Tables 1 and 4: policies", units, corrected, rows, hours=7.0),
     "skeleton-stages": Part(
         "Skeleton2Humanoid, Table 1: stages I and II and the floor", stage_units, staged, rows, hours=0.1
+    ),
+    "skeleton-iterations": Part(
+        "Skeleton2Humanoid, Tables 5 and 6", iterated_units, iterated, iterated_rows, hours=0.1
     ),
     "skeleton-places": Part(
         "rotations from places of joints alone", places_units, placed, placed_rows, hours=0.02
