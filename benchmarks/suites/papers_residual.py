@@ -49,6 +49,8 @@ CLIPS = {
     "90_11": ("cmu_amc/rfc/90_11.amc", 60.0),
     "05_07": ("cmu_amc/rfc/05_07.amc", None),
 }
+#: One who sits on a chair that is not there, as in the paper's supplement: hand-keyed.
+SITTING = "other/keyed_cc0/human-base-animations.glb", "Sitting_Talking_Loop"
 
 
 SKELETON = "cmu_amc/rfc/08.asf"
@@ -67,7 +69,9 @@ SMOOTH = 5
 
 
 def clip_of(data: Path, name: str) -> Clip:
-    """One of `CLIPS`."""
+    """One of `CLIPS`, or "sitting"."""
+    if name == "sitting":
+        return read_clip(data / SITTING[0], take=SITTING[1])
     file, fps = CLIPS[name]
     return read_clip(data / file, skeleton=data / SKELETON if file.endswith(".amc") else None, fps=fps)
 
@@ -140,6 +144,13 @@ def units(places: Places) -> list[str]:
     ]
     clips, factors = GAINS
     return own + [f"{c}; rfc-implicit, gains by {f:g}, seed 0" for f in factors for c in clips]
+
+
+def sitting_units(places: Places) -> list[str]:
+    """Methods and seeds of one who sits without a chair."""
+    seeds = SEEDS[:1] if places.smoke else SEEDS
+    methods = ("deepmimic", "rfc-explicit", "rfc-implicit")
+    return ["sitting; nothing, seed 0", *(f"sitting; {m}, seed {s}" for s in seeds for m in methods)]
 
 
 def trained(places: Places, unit: str) -> Any:
@@ -216,5 +227,6 @@ def timed_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 
 PARTS = {
     "residual forces": Part("Figure 2 of Residual Force Control", units, trained, rows, hours=3.0),
+    "residual sitting": Part("sitting without a chair", sitting_units, trained, rows, hours=0.3),
     "residual times": Part("a control step's time", timed_units, timed, timed_rows, hours=0.02),
 }
