@@ -2,9 +2,8 @@
 
 Each training on a small library is one switch away from the one that it is compared with, with the same
 samples, the cloning of the expert counted, and without any help (but for "uhc-helped"). All clips from
-their first frames, exactly and from starts that are drawn, beside "nothing" (action 0). A difference of
-done clips is between means over two seeds; its spread is the mean spread of the seeds. A training that
-was stopped goes on. Not measured: a top-1 mixture of experts (no setting; `means` is the code's
+their first frames, beside "nothing" (action 0); ranges are those of the seeds. A training that was
+stopped goes on. Not measured: a top-1 mixture of experts (no setting; `means` is the code's
 mixture).
 """
 
@@ -18,7 +17,7 @@ from typing import Any
 
 from benchmarks.common.clips import SIXTY, Places, moment
 from benchmarks.common.field import figures, measured
-from benchmarks.common.rows import Figure
+from benchmarks.common.rows import Figure, between
 from benchmarks.common.runner import Part, Raws
 from poise.body import BodyConfig
 from poise.jobs import runs
@@ -29,7 +28,6 @@ from poise.jobs.run_file import RUN_FILE
 from poise.learn import AmpConfig, CloneConfig, PPOConfig, Until
 from poise.motion import ClipLibrary
 from poise.papers.perpetual.ablations import StagedPerpetual
-from poise.recipes.body_shapes import BodyShapes
 from poise.recipes.perpetual import build
 from poise.recipes.residual_force_settings import ResidualForce
 
@@ -66,26 +64,6 @@ MORE = {
 UHC = ("uhc", "uhc-helped")
 
 
-#: What the tracker knows beside the paper, each by itself on the first and at last together.
-_BARE = LADDER["relaxed"] | {"heading": "twist"}
-
-
-_PRICES = {"action_rate": 3.0, "foot_slide": 0.2}
-
-
-INGREDIENTS = {
-    "bare": _BARE,
-    "heading": _BARE | {"heading": "hips"},
-    "window": _BARE | {"window": (2, 4, 8)},
-    "filter": _BARE | {"filter": 0.5},
-    "root": _BARE | {"root": 0.2},
-    "prices": _BARE | _PRICES,
-    "own-bodies": _BARE | {"shapes": BodyShapes(own=True)},
-    "as-shipped": _BARE | {"window": (2, 4, 8), "root": 0.2} | _PRICES,
-    "together": _BARE | {"heading": "hips", "window": (2, 4, 8), "filter": 0.5, "root": 0.2} | _PRICES,
-}
-
-
 def settings(name: str, seed: int) -> StagedPerpetual:
     """One run's."""
     additive = StagedPerpetual.additive(
@@ -97,7 +75,7 @@ def settings(name: str, seed: int) -> StagedPerpetual:
     if name.startswith("absolute"):
         # Noise in shares of a joint's range.
         ppo = replace(ppo, std=0.02)
-    return replace(additive, ppo=ppo, **(LADDER | MORE | INGREDIENTS).get(name, {}))
+    return replace(additive, ppo=ppo, **(LADDER | MORE).get(name, {}))
 
 
 def uhc(name: str, seed: int) -> ResidualForce:
@@ -123,18 +101,11 @@ AGAINST = {
     "primitives-4": "progressive",
     "uhc": "relaxed",
     "uhc-helped": "uhc",
-    "heading": "bare",
-    "window": "bare",
-    "filter": "bare",
-    "root": "bare",
-    "prices": "bare",
-    "own-bodies": "bare",
-    "as-shipped": "bare",
-    "together": "bare",
 }
 
 
 NOTHING = "nothing (action 0)"
+EXACT = (0,)
 
 
 @cache
@@ -152,7 +123,7 @@ def units(places: Places) -> list[str]:
     """The null, rows and seeds."""
     if places.smoke:
         return [NOTHING, "relaxed, seed 0"]
-    return [NOTHING, *(f"{n}, seed {s}" for n in (*LADDER, *MORE, *UHC, *INGREDIENTS) for s in SEEDS)]
+    return [NOTHING, *(f"{n}, seed {s}" for n in (*LADDER, *UHC, *MORE) for s in SEEDS)]
 
 
 def ablated(places: Places, unit: str) -> Any:
@@ -160,7 +131,7 @@ def ablated(places: Places, unit: str) -> Any:
     name, _, seed = unit.partition(", seed ")
     if unit == NOTHING:
         task = build(library(places), tiny(places, settings("relaxed", 0)))
-        return measured(task, None)
+        return measured(task, None, EXACT)
     out = places.work / "perpetual" / f"{name}-{seed}"
     until = Until(samples=32 if places.smoke else SAMPLES)
     if name in UHC:
@@ -170,7 +141,7 @@ def ablated(places: Places, unit: str) -> Any:
         task = open_run(out).task
         policy, meta = runs.trained_policy(out, task)
         _, scale = runs.help_left(task, meta) if name == "uhc-helped" else (0.0, 0.0)
-        return measured(task, policy, help_scale=scale)
+        return measured(task, policy, EXACT, scale)
     config = tiny(places, settings(name, int(seed)))
     if not (out / RESULT).exists():
         if (out / RUN_FILE).exists():
@@ -179,7 +150,7 @@ def ablated(places: Places, unit: str) -> Any:
             task = begin(out, library(places, config.shapes.own), config, "library")
         train(task, out, until, threads=1)
     run = open_run(out)
-    return measured(run.task, run.policy)
+    return measured(run.task, run.policy, EXACT)
 
 
 def tiny(places: Places, config: StagedPerpetual) -> StagedPerpetual:
@@ -192,26 +163,31 @@ def tiny(places: Places, config: StagedPerpetual) -> StagedPerpetual:
 
 
 def rows(places: Places, raws: Raws) -> Iterator[Figure]:
-    """Figures of each row over its seeds, and differences of the share done."""
+    """Figures of each row from exact starts, with their range over seeds, and differences of the share
+    done."""
     done: dict[str, list[float]] = {}
     for name in dict.fromkeys(u.partition(", seed ")[0] for u in raws):
         own = [r for u, r in raws.items() if u.partition(", seed ")[0] == name]
-        done[name] = [statistics.fmean(e["won"]["phc"] for e in r) for r in own]
+        subject = f"Perpetual Humanoid Control, Table 3; {name}"
         policy = "" if name == NOTHING else f"{name} (trained for this table)"
-        for f in figures(f"Perpetual Humanoid Control, Table 3; {name}", [e for r in own for e in r]):
-            yield f._replace(policy=policy, seeds=len(own))
-    spreads = [max(v) - min(v) for v in done.values() if len(v) > 1]
-    spread = f"+- {statistics.fmean(spreads):.3f}" if spreads else ""
+        seeds = [{f.metric: f for f in figures(subject, r) if f.subject == subject} for r in own]
+        done[name] = [s["done"].value for s in seeds]
+        for metric, f in seeds[0].items():
+            values = [s[metric].value for s in seeds if metric in s]
+            mean = statistics.fmean(values)
+            yield f._replace(value=mean, spread=between(values), policy=policy, seeds=len(values))
+        if policy:
+            yield Figure(subject, "samples", SAMPLES, len(own), seeds=len(own), policy=policy)
     for name, other in AGAINST.items():
         if name in done and other in done:
-            gap = statistics.fmean(done[name]) - statistics.fmean(done[other])
+            gaps = [a - b for a, b in zip(done[name], done[other], strict=False)]
             yield Figure(
                 f"Perpetual Humanoid Control, Table 3; {name} beside {other}",
                 "done_more",
-                gap,
-                len(done[name]),
-                spread,
-                len(done[name]),
+                statistics.fmean(gaps),
+                len(gaps),
+                between(gaps),
+                len(gaps),
                 f"{name} (trained for this table)",
             )
 
