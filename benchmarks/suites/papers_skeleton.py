@@ -257,7 +257,7 @@ LOOKS = "base + TTA + universal policy with lookahead"
 TWIN = "base + TTA + IK, beside kinematics.clip_ik"
 #: The universal policy that goes on on the windows, N and N m of help that fades from there to none,
 #: and control steps of each length.
-ONWARD, HELP_N, ONWARD_SAMPLES = "from the tracker", 100.0, 1_500_000
+ONWARD, HELP_N, ONWARD_SAMPLES = "from the tracker", 100.0, 1_000_000
 #: Stages that a policy of all of them goes without, at the longest transition: iterations of
 #: adaptation, the inverse kinematics, the floor.
 WITHOUT: dict[str, tuple[int, bool, bool]] = {
@@ -311,8 +311,10 @@ def units(places: Places) -> list[str]:
         return [f"5 frames; {k}, seed 0" for k in ("full", "full, without the floor", ONWARD)]
     out = [f"{n} frames; {LOOKS}" for n in LENGTHS]
     out += [f"{n} frames; {v}, seed {s}" for s in SEEDS for v in (ONWARD, "full") for n in LENGTHS]
-    kinds = [v for v in (*VARIANTS, *WITHOUT) if v != "full"]
-    return out + [f"{LENGTHS[-1]} frames; {v}, seed {s}" for s in SEEDS for v in kinds]
+    table_4 = [v for v in VARIANTS if v not in ("full", "full to zero")]
+    out += [f"{LENGTHS[-1]} frames; {v}, seed {s}" for s in SEEDS for v in table_4]
+    once = ["full to zero", *(v for v in WITHOUT if v != "full")]
+    return out + [f"{LENGTHS[-1]} frames; {v}, seed {SEEDS[0]}" for v in once]
 
 
 def corrected(places: Places, unit: str) -> Any:
