@@ -432,18 +432,15 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
         policy = stated(("inbetween", "tracker")) if kind == LOOKS else policy
         if "samples" in own[0]:
             policy = f"{kind} (trained for this table)"
+        subject = f"Skeleton2Humanoid, {unit}"
         for key in own[0].keys() - {"policy"}:
-            values = np.mean([r[key] for r in own], axis=0)
-            error = values.std(ddof=1) / math.sqrt(len(values)) if values.ndim else math.nan
-            yield Figure(
-                f"Skeleton2Humanoid, {unit}",
-                key,
-                float(values.mean()),
-                values.size if values.ndim else len(own[0]["l2p"]) if "l2p" in own[0] else COUNT,
-                f"+- {error:.2g}" if values.ndim else "",
-                len(own),
-                policy,
-            )
+            values = np.atleast_1d(np.mean([r[key] for r in own], axis=0))
+            # Feet that never touch the floor do not slide.
+            values = values[np.isfinite(values)]
+            error = values.std(ddof=1) / math.sqrt(len(values)) if len(values) > 1 else None
+            spread = "" if error is None else f"+- {error:.2g}"
+            n = COUNT if error is None else len(values)
+            yield Figure(subject, key, float(values.mean()), n, spread, len(own), policy)
 
 
 # --- places alone -----------------------------------------------------------------------------------
