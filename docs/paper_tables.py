@@ -374,7 +374,7 @@ _S2H_1_OURS = PaperTable(
                 (*_PHYSICS, "-l2p"),
             ),
             (
-                "TTA, the universal policy trained on it (help to none)",
+                "TTA, `poise track` trained on it (help to none)",
                 "from the tracker",
                 "better",
                 "base",

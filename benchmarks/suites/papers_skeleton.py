@@ -32,7 +32,7 @@ from benchmarks.common.clips import WALK, Places
 from benchmarks.common.policies import stated
 from benchmarks.common.rows import Figure, mean_of, of
 from benchmarks.common.runner import Part, Raws
-from poise.body import generate_table
+from poise.body import Humanoid, generate_table
 from poise.env import Reference
 from poise.formats import read_clip
 from poise.formats.landmarks import complete
@@ -50,7 +50,6 @@ from poise.jobs.track.learning import helped
 from poise.jobs.track.learning import settings as learning
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import with_guide
-from poise.jobs.track_settings import Controller
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened
 from poise.kinematics import IkBody, analytic_ik, clip_ik, fit_humanoid, ik_body, qpos_to_clip
@@ -133,21 +132,32 @@ def figures(
 ) -> dict[str, list[float]]:
     """FP, FQ, JQ, SM, L2P and slide of each transition."""
     rows = slice(PAST, PAST + length)
-    table, soles = task.humanoid.table, list(task.humanoid.feet)
-    low = lowest_height(table, made.pos.double(), made.quat.double())[:, rows]
-    feet = low[..., soles]
     moved = torch.diff(made.pos[:, PAST - 1 : PAST + length + 1], dim=1).norm(dim=-1)
-    points = foot_points(made.pos[:, rows], made.quat[:, rows], shapes_of(table), soles)
     pairs = zip(made.pos[:, rows].double(), truth.pos[:, rows].double(), strict=True)
-    each = {
-        "fp_mm": 1000 * feet.clamp_max(0.0).mean((-2, -1)),
-        "fq_percent": 100 * (feet < -THROUGH).double().mean((-2, -1)),
-        "jq_percent": 100 * (low < -THROUGH).double().mean((-2, -1)),
-        "sm_mm": 1000 * moved.mean((-2, -1)),
-        "l2p": torch.stack([l2p(m, t, std) for m, t in pairs]),
-        "slide_mm_per_s": torch.as_tensor(foot_slide(points, FPS)),
+    return {
+        **on_floor(made, task.humanoid, length),
+        "sm_mm": rounded(1000 * moved.mean((-2, -1))),
+        "l2p": rounded(torch.stack([l2p(m, t, std) for m, t in pairs])),
     }
-    return {name: [round(float(x), 4) for x in values] for name, values in each.items()}
+
+
+def on_floor(made: Motion, humanoid: Humanoid, length: int) -> dict[str, list[float]]:
+    """FP, FQ, JQ and slide of each transition."""
+    rows = slice(PAST, PAST + length)
+    pos, quat, feet = made.pos[:, rows], made.quat[:, rows], list(humanoid.feet)
+    low = lowest_height(humanoid.table, pos.double(), quat.double())
+    points = foot_points(pos, quat, shapes_of(humanoid.table), feet)
+    return {
+        "fp_mm": rounded(1000 * low[..., feet].clamp_max(0.0).mean((-2, -1))),
+        "fq_percent": rounded(100 * (low[..., feet] < -THROUGH).double().mean((-2, -1))),
+        "jq_percent": rounded(100 * (low < -THROUGH).double().mean((-2, -1))),
+        "slide_mm_per_s": rounded(torch.as_tensor(foot_slide(points, FPS))),
+    }
+
+
+def rounded(values: Tensor) -> list[float]:
+    """Numbers with four digits after the point."""
+    return [round(float(x), 4) for x in values]
 
 
 def of_reference(reference: Reference) -> Motion:
@@ -195,20 +205,23 @@ def policy_row(
 
 
 def tracked_row(
-    clips: list[Clip],
-    tracker: Tracker,
-    controller: Controller,
-    b: Bench,
-    length: int,
+    clips: list[Clip], tracker: Tracker, b: Bench, length: int, own: bool = False
 ) -> dict[str, Any]:
-    """A universal policy on the same motions; no help."""
-    how = TrackConfig(controller=controller, threads=1, supports="none")
-    done = [track(c, tracker, how) for c in clips]
+    """A universal policy with lookahead on the same motions; no help.
+
+    own: on the clips' own bones, so that soles are those of the body that was simulated.
+    """
+    done = [track(c, tracker, TrackConfig(threads=1, supports="none")) for c in clips]
     frames = clips[0].frames
     # On the floor that it was simulated on: what is written is as high as the source again.
     made = on_joints([trim(d.at_home(d.motion(), False), 0, frames - 1) for d in done], b.joints)
+    found = figures(made, b.truth, b.task, b.std, length)
+    if own:
+        rolled = [d.evaluation.rollouts for d in done]
+        parts = ([r.pos[0, :frames] for r in rolled], [r.quat[0, :frames] for r in rolled])
+        found |= on_floor(Motion(*map(torch.stack, parts)), tracker.humanoid, length)
     return {
-        **figures(made, b.truth, b.task, b.std, length),
+        **found,
         "succ": [float(not d.failures) for d in done],
         "mpjpe_mm": [d.card.mpjpe_mm for d in done],
         "mpjpe_global_mm": [d.card.mpjpe_global_mm for d in done],
@@ -217,9 +230,9 @@ def tracked_row(
     }
 
 
-def learned_on(clips: list[Clip], folder: Path, samples: int, seed: int) -> tuple[Tracker, int]:
+def learned_on(clips: list[Clip], folder: Path, samples: int, seed: int) -> Tracker:
     """The policy that ships, trained on the windows with a residual force that fades to none, on the
-    windows' own bones, and its samples."""
+    windows' own bones."""
     tracker = open_run(None).tracker.with_bones_of(clips[0])
     placed = [place(c, tracker) for c in clips]
     config = helped(replace(learning(tracker.config, seed), num_envs=512), HELP_N)
@@ -235,8 +248,7 @@ def learned_on(clips: list[Clip], folder: Path, samples: int, seed: int) -> tupl
             print(f"{folder.name}: {progress.share:.0%}, {progress.succeeded} done", flush=True)
 
     train_library(task, folder, Until(samples=samples), told, 1, False, trained=trained)
-    made = replace(policy_of_run(read_run(folder)), onto=tracker.onto)
-    return made, int(made.about["samples"])
+    return replace(policy_of_run(read_run(folder)), onto=tracker.onto)
 
 
 COUNT, ITERATIONS, SEEDS = 32, 60, (0, 1)
@@ -324,13 +336,13 @@ def corrected(places: Places, unit: str) -> Any:
     b = bench(places, n)
     if kind == LOOKS:
         tracker = open_run(None).tracker
-        return tracked_row(b.adapted, tracker, "auto", b, n) | {"policy": digest_of(tracker.policy)}
+        return tracked_row(b.adapted, tracker, b, n) | {"policy": digest_of(tracker.policy)}
     variant, _, seed = kind.partition(", seed ")
     folder = places.work / "s2h" / f"{n}-{re.sub('[^a-z]+', '-', variant)}-{seed}"
     if variant == ONWARD:
         asked = 64 if places.smoke else ONWARD_SAMPLES
-        tracker, samples = learned_on(b.adapted, folder, asked, int(seed))
-        return tracked_row(b.adapted, tracker, "policy", b, n) | {"samples": samples}
+        tracker = learned_on(b.adapted, folder, asked, int(seed))
+        return tracked_row(b.adapted, tracker, b, n, own=True) | {"samples": asked}
     adapt, analytic, floor = WITHOUT.get(variant, WITHOUT["full"])
     own = settings("full" if variant in WITHOUT else variant, budget(places), seed=int(seed))  # type: ignore[arg-type]
     if places.smoke:
