@@ -10,6 +10,7 @@ nothing (action 0).
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -28,7 +29,7 @@ from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
 from poise.env.generator_goal import GeneratorGoal, Steering
 from poise.env.recovery.recovering import FALLS, TRACKS, Recovering
-from poise.jobs.endless.dreaming import dream
+from poise.jobs.endless.dreaming import dream, rehearsed
 from poise.jobs.endless.dreamt import PIECE, Figures
 from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.open import open_run
@@ -79,15 +80,15 @@ def repeats(humanoid: Humanoid, qpos: np.ndarray, fps: float) -> dict[str, Any]:
     }
 
 
-def visited(humanoid: Humanoid, seeds: Tensor, qpos: np.ndarray, fps: float) -> set[int]:
-    """Which of `seeds (S, p, 7 + n)`, a second of the library each, evenly spread, are the nearest to
-    some second of a motion."""
+def visited(humanoid: Humanoid, seeds: Tensor, qpos: np.ndarray, fps: float) -> list[int]:
+    """Which of `seeds (S, p, 7 + n)`, a second of the library each, evenly spread, is the nearest to a
+    motion, of each of its half seconds."""
     p = seeds.shape[1]
     places = local_places(humanoid, seeds.flatten(0, 1)).unflatten(0, seeds.shape[:2])
     some = places[:, :: p // 5].flatten(1)
     local = local_places(humanoid, torch.tensor(qpos))
     own = [local[k : k + p : p // 5].flatten() for k in range(0, len(local) - p + 1, p // 2)]
-    return set(torch.cdist(torch.stack(own), some).argmin(1).tolist()) if own else set()
+    return torch.cdist(torch.stack(own), some).argmin(1).tolist() if own else []
 
 
 # --- worlds side by side ---------------------------------------------------------------------------
@@ -164,25 +165,36 @@ def rollouts(
     past: str = "own",
     targets: tuple[tuple[float, float], ...] = (),
     label_seconds: float = 10.0,
+    tries: int = 1,
 ) -> Rollouts:
     """`count` rollouts; number k begins from a past drawn with seed k, all later draws are of seed 0."""
     task = imitation_of(tracker, [place(tracker.example, tracker)])
     task = replace(task, task=replace(task.task, help_by="all"))
     rate, steps = tracker.config.sim.control_hz, round(seconds * tracker.config.sim.control_hz)
     begins = [made.begin(1, torch.Generator().manual_seed(k)) for k in range(count)]
-    wishing = made.wishing(0.0 if targets else label_seconds, count)
-    motion = GeneratorGoal(
-        wishing,
-        tracker.humanoid,
-        rate,
-        count,
-        lead=max(*tracker.config.window, 1) + 1,
-        pasts=torch.cat(begins),
-        steering=Steering(targets),
-        simulated=past == "simulated",
-    )
-    goal = Recovering(motion, tracker.recovery_clips if recover else None)
-    goal.reset(torch.arange(count))
+    pasts = torch.cat(begins)
+
+    def following(worlds: int, plans: bool) -> Recovering:
+        motion = GeneratorGoal(
+            made.wishing(0.0 if targets else label_seconds, worlds),
+            tracker.humanoid,
+            rate,
+            worlds,
+            lead=max(*tracker.config.window, 1) + 1,
+            plans=plans,
+            pasts=pasts if plans else pasts[:1].expand(worlds, -1, -1),
+            steering=Steering(targets),
+            simulated=past == "simulated",
+        )
+        out = Recovering(motion, tracker.recovery_clips if recover else None, plans=plans)
+        out.reset(torch.arange(worlds))
+        return out
+
+    goal = following(count, True)
+    acts = tracker.policy if acts is None else acts
+    tried = None
+    if tries > 1:
+        acts = tried = rehearsed(acts, tracker, task, following, tries, 1)
     width = tracker.humanoid.model.nq
     empty = np.zeros((2, count, steps, width), np.float32)
     out = Rollouts(empty[0], empty[1], 0, [], [], [])
@@ -190,20 +202,22 @@ def rollouts(
     try:
         over = False
         while out.count < steps and not over:
+            if tried is not None:
+                tried.watch(env, goal)
             env.backend.write(None, *goal.start(None))
             env.age[:] = 0
             try:
                 keeps = _Keeps(goal, out)
                 after = round(AFTER_S * rate) if recover else 0
-                simulate(
-                    env, acts or tracker.policy, env.set_goal(goal), steps - out.count + after, keeps
-                )
+                simulate(env, acts, env.set_goal(goal), steps - out.count + after, keeps)
                 over = keeps.over
             except UnstableError:
                 out.bad += 1
                 env.action[:] = 0
     finally:
         env.close()
+        if tried is not None:
+            tried.copies.close()
     told(out, goal)
     return out
 
@@ -215,6 +229,7 @@ NAMES = ("foot_slide_mm_per_s", "penetration_mm", "jerk_m_per_s3", "speed_m_per_
 STEP_M, POINTS = 5.0, 20
 #: Subjects, and their rollouts: settings, how many, s of each, hours of a core.
 ROLLOUTS: dict[str, tuple[dict[str, Any], int, float, float]] = {
+    "futures tried, ten minutes each": ({"tries": 8}, 20, 600.0, 1.0),
     "policy alone": ({}, 20, 60.0, 0.1),
     "policy alone, ten minutes each": ({}, 20, 600.0, 1.0),
     "policy alone, recovery off": ({"recover": False}, 20, 60.0, 0.05),
@@ -247,16 +262,19 @@ def went(made: Rollouts, world: int, seconds: float, recover: bool = True) -> di
     until = falls[0] if falls and not recover else made.count / fps
     frames = min(made.count, max(4, round(until * fps)))
     done = made.done[world, :frames].astype(float)
-    seen = sorted(visited(humanoid, model.seeds, done, fps))
-    kinds = set[int]() if model.kinds is None else set(model.kinds[seen].tolist())
+    seen = visited(humanoid, model.seeds, done, fps)
+    kinds = Counter[int]() if model.kinds is None else Counter(model.kinds[seen].tolist())
+    found = figures_of(done)
     return {
         "counted_s": until,
         "falls": len(falls),
         "away_s": away,
         "stayed_down": int(down),
-        **{k: figures_of(done)[k] for k in NAMES},
+        **{k: found[k] for k in NAMES},
+        "still": found["still_s"] / until,
+        "most": kinds.most_common(1)[0][1] / len(seen) if kinds else None,
         **repeats(humanoid, done, fps),
-        "visited": len(seen),
+        "visited": len(set(seen)),
         "labels": len(kinds),
     }
 
@@ -305,6 +323,9 @@ def rollout_rows(places: Places, raws: Raws, name: str) -> Iterator[Figure]:
         "hours": counted / 3600,
         "repeated_share": mean_of(r["repeated_share"] for r in rows),
         "labels_a_rollout": mean_of(r["labels"] for r in rows),
+        "most_of_a_label": mean_of(r["most"] for r in rows),
+        "still_share": mean_of(r["still"] for r in rows),
+        "without_a_fall": sum(not r["falls"] for r in rows) / len(rows),
         "visited_a_rollout": mean_of(r["visited"] for r in rows),
         "went_bad": sum(r["bad"] for raw in raws.values() for r in raw if "bad" in r),
     }

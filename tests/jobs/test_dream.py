@@ -164,7 +164,7 @@ def test_a_world_that_goes_bad_is_put_back(
             return policy.act(obs) * (float("nan") if calls[0] == 10 else 1.0)
 
     bad = replace(tracker, policy=Bad())  # type: ignore[arg-type]
-    made = dream(1.0, model, bad, controller="policy", threads=1)
+    made = dream(1.0, model, bad, controller="policy", tries=1, threads=1)
     assert made.motion().frames == 30 and np.isfinite(made.motion().positions()).all()
     assert any("went bad at 0.3 s" in n for n in made.notes)
 

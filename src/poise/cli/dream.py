@@ -53,6 +53,7 @@ def run(
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None,
     controller: Literal["lookahead", "policy"] = "lookahead",
     budget: Budget = None,
+    tries: Annotated[int, arg(metavar="K")] = 8,
     recover: Flag = True,
     past: Literal["own", "simulated"] = "own",
     seed: Annotated[int, arg(metavar="S")] = 0,
@@ -94,6 +95,8 @@ def run(
         controller: lookahead tries in copies of the character before it acts; policy acts at once, ten
             times faster and rougher.
         budget: simulated control steps of lookahead for each that is made, by default 192.
+        tries: futures of the kinematic policy that copies of a character try before it goes on with one
+            that it can do; 1 takes what comes.
         recover: leave a character that has fallen where it lies.
         past: what the kinematic policy goes on from: its own frames, or what the character did.
         seed: seed of all draws.
@@ -140,6 +143,7 @@ def run(
         seed=seed,
         controller=controller,
         lookahead=ahead,
+        tries=tries,
         recover=recover,
         past=past,
         style=style,

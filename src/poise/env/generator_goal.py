@@ -153,6 +153,21 @@ def path_cost(path: WalkPath, along: Tensor, off: Tensor, first: float, fps: flo
     return OFF_COST * off.mean(1) + FARTHEST_COST * off.amax(1) + LATE_COST * late
 
 
+@dataclass(frozen=True, eq=False)
+class Futures:
+    """What may follow, in the order in which a generator or the way that is to be gone prefers it.
+
+    Attributes:
+        made: `(K, f, 7 + n)`. along: `(K, f)` m along the path; None where there is none.
+    """
+
+    made: Tensor
+    along: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.made)
+
+
 class GeneratorGoal(BufferedGoal):
     """Worlds follow motions that a generator makes as they go, from its own frames (line 11 of
     Algorithm 1). Where it makes what is no motion, the world's goal comes to rest, and `notes` says so.
@@ -209,6 +224,8 @@ class GeneratorGoal(BufferedGoal):
         self.waits = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self.steps = torch.zeros_like(self.at)
         self.reached, self._passed = list[tuple[int, int]](), torch.zeros_like(self.at)
+        # What was chosen for worlds before it is needed.
+        self._chosen = dict[int, tuple[Tensor, Tensor | None]]()
         self.led = dict[int, Tensor]()
         self.strayed = torch.zeros(num_envs, 4, dtype=torch.float64, device=self.device)
         # m along the path of the roots, of the last frames that are known, and where the roots are.
@@ -241,6 +258,8 @@ class GeneratorGoal(BufferedGoal):
     def begin_from(self, ids: Tensor, frames: Tensor) -> None:
         """Worlds `ids (n,)` do `frames (n, past, 7 + n)`, and then what the generator makes of them."""
         self.clear(ids)
+        for world in ids.tolist():
+            self._chosen.pop(world, None)
         self.extend(ids, frames)
         self.at[ids], self._known[ids] = 0, 0
         self._known_along[ids] = self._along[ids]
@@ -252,6 +271,13 @@ class GeneratorGoal(BufferedGoal):
         begun = (self.count[ids] > 0) & ~self.waits[ids]
         known = self.count[ids] - self.lead
         short = ids[begun & (self.at[ids] + 1 >= known) & (self.at[ids] < self.last[ids])]
+        for i in short.tolist():
+            if (chosen := self._chosen.pop(i, None)) is not None:
+                frames, along = chosen
+                self.extend(torch.tensor([i], device=self.device), frames[None])
+                if along is not None:
+                    self._known_along[i] = along
+        short = short[self.at[short] + 1 >= self.count[short] - self.lead]
         if not len(short):
             return
         index = self.count[short].unsqueeze(1) - g.past + torch.arange(g.past, device=self.device)
@@ -279,30 +305,77 @@ class GeneratorGoal(BufferedGoal):
         """`(n, future, 7 + n)` frames that follow `past (n, past, 7 + n)` in worlds `ids (n,)`; where
         there is somewhere to go, of several futures the best."""
         past = self._past(past, ids) if self.simulated else past
-        propose = getattr(self.generator, "propose", None)
-        if propose is None or not self.steering.chooses:
+        if not (self._proposes and self.steering.chooses):
             return self.generator.generate(past, ids, self.rng)
         out = list[Tensor]()
         for row, world in enumerate(ids.tolist()):
-            one, last, target = slice(row, row + 1), past[row, -1].double(), self._target(world)
-            path, begun = self._path(world, last)
-            goes = target is not None or path is not None
-            # A place to go counts alone, not what the world wishes.
-            wishes = None if goes else ids[one]
-            others, boxes = self._others(world), self.steering.boxes
-            crowded = any(float((o - last[:2]).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
-            count = PROPOSALS if target is not None else SOME if goes or crowded else FEW
-            made = propose(past[one], self.rng, count, wishes)[0]
-            cost = torch.zeros(len(made)).to(made)
-            along = None
-            if path is not None:
-                made, along, off = path.bent(made, last, begun, self.rate_hz, BEND, WALKS)
-                cost = path_cost(path, along, off, begun, self.rate_hz)
-            best = int((cost + cost_of(made[..., :2], target, others, boxes)).argmin())
-            if along is not None:
-                self._known_along[world] = along[best, self.keeps - 1]
-            out.append(made[best])
+            best = self._preferred(world, past[row : row + 1], 1, True)
+            if best.along is not None:
+                self._known_along[world] = best.along[0, self.keeps - 1]
+            out.append(best.made[0])
         return torch.stack(out)
+
+    @property
+    def _proposes(self) -> bool:
+        return getattr(self.generator, "propose", None) is not None
+
+    def _preferred(self, world: int, past: Tensor, count: int, wished: bool) -> Futures:
+        """The best of what may follow `past (1, past, 7 + n)`, at most so many."""
+        propose = self.generator.propose  # type: ignore[attr-defined]
+        ids = torch.tensor([world], device=self.device)
+        if not self.steering.chooses:
+            return Futures(propose(past, self.rng, count, ids if wished else None)[0])
+        last, target = past[0, -1].double(), self._target(world)
+        path, begun = self._path(world, last)
+        goes = target is not None or path is not None
+        others, boxes = self._others(world), self.steering.boxes
+        crowded = any(float((o - last[:2]).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
+        many = PROPOSALS if target is not None else SOME if goes or crowded else FEW
+        # A place to go counts alone, not what the world wishes.
+        made = propose(past, self.rng, many, ids if wished and not goes else None)[0]
+        cost = torch.zeros(len(made)).to(made)
+        along = None
+        if path is not None:
+            made, along, off = path.bent(made, last, begun, self.rate_hz, BEND, WALKS)
+            cost = path_cost(path, along, off, begun, self.rate_hz)
+        cost = cost + cost_of(made[..., :2], target, others, boxes)
+        best = cost.argsort(stable=True)[:count]
+        return Futures(made[best], None if along is None else along[best])
+
+    # --- what is tried before -----------------------------------------------------------------
+
+    def due(self) -> list[int]:
+        """Worlds for which more frames are made in the next step, unless they are chosen already."""
+        ends = self.at + 2 >= self.count - self.lead
+        short = (self.count > 0) & ~self.waits & ends & (self.at + 1 < self.last)
+        return [i for i in short.nonzero().squeeze(-1).tolist() if i not in self._chosen]
+
+    def forget(self, world: int) -> None:
+        """Frames of a world that are yet to come are made anew."""
+        self.count[world] = self.at[world] + 1
+        self._known_along[world] = self._along[world]
+
+    def futures(self, world: int, count: int, wished: bool = True) -> Futures:
+        """What may follow in a world, at most so many; a generator that proposes none has one.
+
+        wished: as the world wishes, or whatever the generator makes.
+        """
+        p = self.generator.past
+        index = self.count[world] - p + torch.arange(p, device=self.device)
+        past = self.qpos[world, index.clamp_min(0) % self.size][None]
+        ids = torch.tensor([world], device=self.device)
+        past = self._past(past, ids) if self.simulated else past
+        if not self._proposes:
+            return Futures(self.generator.generate(past, ids, self.rng))
+        return self._preferred(world, past, count, wished)
+
+    def choose(self, world: int, futures: Futures, which: int, frames: int) -> None:
+        """So many frames of one of some futures are what follows in a world; what is no motion is left
+        out."""
+        kept = futures.made[which, :frames]
+        if bool(kept.isfinite().all()):
+            along = None if futures.along is None else futures.along[which, len(kept) - 1]
+            self._chosen[world] = kept.to(self.qpos), along
 
     def is_free(self, world: int) -> bool:
         """Whether a world has no target left and is on no path."""

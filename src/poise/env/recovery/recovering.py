@@ -161,6 +161,12 @@ class Recovering(Goal):
         return self.goal.clips
 
     @property
+    def endless(self) -> GeneratorGoal:
+        """The generator's motion that is come back to; there is one where clips are not followed."""
+        assert isinstance(self.goal, GeneratorGoal)
+        return self.goal
+
+    @property
     def reached(self) -> list[tuple[int, int]]:
         """See `GeneratorGoal.reached`."""
         return self.goal.reached if isinstance(self.goal, GeneratorGoal) else []

@@ -35,6 +35,7 @@ from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.controllers import NO_CRITIC, look_ahead
 from poise.jobs.track.placement import place
+from poise.jobs.track.pushed import unforeseen
 from poise.jobs.track.recovery_run import helped
 from poise.jobs.track.surroundings import crowd, places
 from poise.jobs.track.tracking import imitation_of
@@ -44,6 +45,8 @@ from poise.kinematics.travel import find_travel, travelled
 from poise.learn.run import interruptible
 from poise.metrics import help_audit
 from poise.motion import Clip
+from poise.plan.rehearsal import Rehearsal
+from poise.recipes.imitation import Imitation
 from poise.score import simulate
 from poise.score.card import NO_HELP, Help
 from poise.settings import changed
@@ -231,11 +234,16 @@ def _go_about(
     if config.controller == "lookahead" and tracker.value is not None:
         acts = ahead = look_ahead(actor, task, config.lookahead, config.threads, config.seed)
         ahead.copies.set_goal(goal(ahead.copies.num_envs, False))
+    rehearsal = None
+    if config.tries > 1:
+        acts = rehearsal = rehearsed(acts, actor, task, goal, config.tries, config.threads)
     try:
         while len(seen) < steps and not seen.stopped():
             # Characters stand where their motion is: at the beginning, and after a simulation went bad.
             if ahead is not None:
                 ahead.watch(env)
+            if rehearsal is not None:
+                rehearsal.watch(env, own)
             env.backend.write(None, *own.start(None))
             env.age[:] = 0
             try:
@@ -251,7 +259,29 @@ def _go_about(
         env.close()
         if ahead is not None:
             ahead.copies.close()
+        if rehearsal is not None:
+            rehearsal.copies.close()
     return own
+
+
+def rehearsed(
+    acts: Acts,
+    tracker: Tracker,
+    task: Imitation,
+    goal: Callable[[int, bool], Recovering],
+    tries: int,
+    threads: int = 0,
+) -> Rehearsal:
+    """A controller `acts` that chooses among so many futures before it goes on, see `plan.rehearsal`.
+
+    Args:
+        goal: makes what so many worlds follow; False where they are copies that make no frames.
+    """
+    copies = (
+        unforeseen(task).bare().env(tries, None, False, threads, help_scale=helped(task), guard=False)
+    )
+    copies.set_goal(tried := goal(tries, False))
+    return Rehearsal(acts, tracker.policy, copies, tried)
 
 
 class _Seen:

@@ -62,6 +62,8 @@ class Dream:
         seed: of all draws.
         controller: the policy looks ahead before it acts, or acts at once.
         lookahead: how it looks ahead; its seed is `seed`.
+        tries: futures of the kinematic policy that copies of a character try before it goes on with one,
+            see `plan.rehearsal`; 1 tries none.
         recover: a character that has fallen gets up and goes on.
         past: what the kinematic policy goes on from: its own frames, as the paper has it, or what the
             character did.
@@ -82,6 +84,7 @@ class Dream:
     seed: int = 0
     controller: Literal["lookahead", "policy"] = "lookahead"
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
+    tries: Annotated[int, Range(1, 256, unit="futures")] = 8
     recover: bool = True
     past: Literal["own", "simulated"] = "own"
     style: str | None = None
