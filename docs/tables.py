@@ -324,14 +324,15 @@ TABLES: dict[str, Table] = {
         (
             Column("falls an hour", ("falls_per_hour",)),
             Column("stayed down", ("stayed_down",)),
+            Column("without a fall", ("without_a_fall",), "%"),
             Column("slide, mm/s", ("foot_slide_mm_per_s",)),
             Column("jerk, m/s³", ("jerk_m_per_s3",)),
             Column("latency p50, p99, ms", ("latency_p50_ms", "latency_p99_ms")),
             Column("losses, came back", ("losses", "came_back")),
         ),
         (
-            Line("dream:policy alone", "`poise dream`, policy alone, twenty minutes"),
-            Line("dream:policy alone, ten minutes each", "the same, ten minutes each"),
+            Line("dream:futures tried, ten minutes each", "`poise dream`, policy, ten minutes each"),
+            Line("dream:policy alone, ten minutes each", "the same, without trying futures"),
             Line("dream:lookahead", "`poise dream`, lookahead, three minutes"),
             Line("live:4 dreaming, 2 cores", "four in real time, lookahead, two cores, three minutes"),
             Line("dream:its library, as recorded", "the recordings that it learned"),

@@ -2,7 +2,8 @@
 predicted.
 
 Nothing helps the character. The policy alone does all rollouts of a part side by side, in as many
-worlds, each from a past that is drawn; rollouts that look ahead are made one by one. What is down in the
+worlds, each from a past that is drawn; where futures are tried, as `poise dream` does, the part says so,
+and those that look ahead, one by one, try them, too. What is down in the
 end has 15 s more to get up; without recovery a rollout counts until the character falls. The null does
 nothing (action 0).
 """
@@ -29,8 +30,8 @@ from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
 from poise.env.generator_goal import GeneratorGoal, Steering
 from poise.env.recovery.recovering import FALLS, TRACKS, Recovering
-from poise.jobs.endless.dreaming import dream, rehearsed
-from poise.jobs.endless.dreamt import PIECE, Figures
+from poise.jobs.endless.dreaming import dream, other_pasts, rehearsed
+from poise.jobs.endless.dreamt import PIECE, Dream, Figures
 from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
@@ -206,10 +207,13 @@ def rollouts(
                 tried.watch(env, goal)
             env.backend.write(None, *goal.start(None))
             env.age[:] = 0
+            obs = env.set_goal(goal)
+            if tried is not None and not out.count:
+                obs = other_pasts(env, goal, tried, made, count)
             try:
                 keeps = _Keeps(goal, out)
                 after = round(AFTER_S * rate) if recover else 0
-                simulate(env, acts, env.set_goal(goal), steps - out.count + after, keeps)
+                simulate(env, acts, obs, steps - out.count + after, keeps)
                 over = keeps.over
             except UnstableError:
                 out.bad += 1
@@ -225,11 +229,13 @@ def rollouts(
 # --- rollouts -------------------------------------------------------------------------------------
 
 NAMES = ("foot_slide_mm_per_s", "penetration_mm", "jerk_m_per_s3", "speed_m_per_s")
+#: Futures that `poise dream` tries.
+TRIES = Dream.tries
 #: m between points, and how many there are.
 STEP_M, POINTS = 5.0, 20
 #: Subjects, and their rollouts: settings, how many, s of each, hours of a core.
 ROLLOUTS: dict[str, tuple[dict[str, Any], int, float, float]] = {
-    "futures tried, ten minutes each": ({"tries": 8}, 20, 600.0, 1.0),
+    "futures tried, ten minutes each": ({"tries": TRIES}, 20, 600.0, 1.0),
     "policy alone": ({}, 20, 60.0, 0.1),
     "policy alone, ten minutes each": ({}, 20, 600.0, 1.0),
     "policy alone, recovery off": ({"recover": False}, 20, 60.0, 0.05),
@@ -350,7 +356,12 @@ def steered(places: Places, unit: str) -> Any:
     """Points reached in turn, and when, against a straight walk at the library's own pace."""
     tracker, _, generator = loaded()
     made = rollouts(
-        tracker, generator, 1, 2.0 if places.smoke else 200.0, targets=points_of(int(unit[5:]))
+        tracker,
+        generator,
+        1,
+        2.0 if places.smoke else 200.0,
+        targets=points_of(int(unit[5:])),
+        tries=TRIES,
     )
     times = [t for _, t in made.reached]
     assert tracker.recovery_clips is not None

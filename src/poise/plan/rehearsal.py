@@ -51,23 +51,38 @@ class Rehearsal:
         self.chosen = [0, 0, 0]
         self._env: ImitationEnv | None = None
         self._goal: GeneratorGoal | None = None
+        self._begun = set[int]()
 
     def watch(self, env: ImitationEnv, goal: Recovering) -> None:
         """Chooses in the worlds of `env`, which follow `goal`, from now on."""
-        self._env, self._goal = env, goal.endless
+        self._env, self._goal, self._begun = env, goal.endless, set()
 
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
         if self._goal is not None and self._env is not None:
-            for world in (self._env.age == 0).nonzero().squeeze(-1).tolist():
-                # What was made where it begins was made before anything could be tried.
-                self._goal.forget(world)
+            if bool((self._env.age == 0).any()):
+                self.begin()
+                obs = self._env.observe()
             for world in self._goal.due():
                 self._choose(world, self._goal)
         return self.acts.act(obs)
 
+    def begin(self) -> list[int]:
+        """Chooses anew in worlds that are yet to make their first step and have chosen nothing yet: what
+        they know was made before anything could be tried. Those in which no copy does a future."""
+        goal, env = self._goal, self._env
+        assert goal is not None and env is not None
+        fresh = [w for w in (env.age == 0).nonzero().squeeze(-1).tolist() if w not in self._begun]
+        stuck = list[int]()
+        for world in fresh:
+            goal.forget(world)
+            stuck += [world] if not self._choose(world, goal) else []
+        self._begun |= set(fresh) - set(stuck)
+        goal.aim(None, None)
+        return stuck
+
     @one_thread()
-    def _choose(self, world: int, goal: GeneratorGoal) -> None:
+    def _choose(self, world: int, goal: GeneratorGoal) -> bool:
         assert self._env is not None
         snapshot = self._env.snapshot(torch.tensor([world]))
         known, best = int(goal.count[world] - 1 - goal.at[world]), None
@@ -78,13 +93,14 @@ class Rehearsal:
             if done:
                 goal.choose(world, futures, which, goal.keeps)
                 self.chosen[0 if k == which == 0 else 1] += 1
-                return
+                return True
             if best is None or lasts > best[2]:
                 best = futures, which, lasts
         assert best is not None
         futures, which, lasts = best
         self.chosen[2] += 1
         goal.choose(world, futures, which, max(FEWEST, min(goal.keeps, lasts - known - SAFE)))
+        return False
 
     def _tried_out(
         self, snapshot: Snapshot, futures: Futures, world: int, goal: GeneratorGoal
@@ -92,10 +108,13 @@ class Rehearsal:
         """Which of some futures is to be taken, for how many control steps from now on a copy does it,
         and whether that is all."""
         copies = self.copies
-        obs, every = copies.restore(snapshot), torch.arange(copies.num_envs)
+        copies.restore(snapshot)
+        every = torch.arange(copies.num_envs)
         # Frames that a copy's own goal may have made are no part of it.
         self.tried.count[:], self.tried.low[:] = goal.count[world], goal.low[world]
         self.tried.extend(every, futures.made[every % len(futures), : goal.keeps])
+        self.tried.aim(None, None)
+        obs = copies.observe()
         steps = int(self.tried.count[0] - self.tried.at[0]) - 2
         lasts, off = torch.full((len(every),), steps), torch.zeros(len(every))
         for k in range(steps):

@@ -123,7 +123,7 @@ def dream(
     try:
         with interruptible() as interrupt:
             seen.stopped = interrupt.is_set
-            goal = _go_about(tracker, made, config, pasts, steps, seen, notes)
+            goal = _go_about(tracker, made, config, pasts, seed_clip is None, steps, seen, notes)
             interrupted = interrupt.is_set()
         for piece in pieces:
             piece.finish()
@@ -187,11 +187,15 @@ def _go_about(
     made: Kinematic,
     config: Dream,
     pasts: Tensor,
+    drawn: bool,
     steps: int,
     seen: _Seen,
     notes: list[str],
 ) -> Recovering:
-    """Simulates until all steps are made or `seen` has seen enough; the goal that was followed."""
+    """Simulates until all steps are made or `seen` has seen enough; the goal that was followed.
+
+    drawn: `pasts` are of the generator, and others will do as well.
+    """
     sits, said = seats_of(config.supports)
     notes += said
     boxes = tuple(footprint(s) for s in config.supports)
@@ -246,8 +250,11 @@ def _go_about(
                 rehearsal.watch(env, own)
             env.backend.write(None, *own.start(None))
             env.age[:] = 0
+            obs = env.set_goal(own)
+            if rehearsal is not None and drawn and not len(seen):
+                obs = other_pasts(env, own, rehearsal, made, config.seed + 1)
             try:
-                simulate(env, acts, env.set_goal(own), steps - len(seen), seen)
+                simulate(env, acts, obs, steps - len(seen), seen)
             except UnstableError as problem:
                 at = len(seen) / tracker.config.sim.control_hz
                 notes.append(
@@ -282,6 +289,29 @@ def rehearsed(
     )
     copies.set_goal(tried := goal(tries, False))
     return Rehearsal(acts, tracker.policy, copies, tried)
+
+
+#: Pasts that are drawn until a copy of a character can go on from one.
+BEGINS = 16
+
+
+def other_pasts(
+    env: ImitationEnv, goal: Recovering, rehearsal: Rehearsal, generator: Kinematic, seed: int
+) -> Tensor:
+    """Draws other pasts where no copy of a character goes on from its own, since some are in the middle
+    of a leap; the observations `(N, O)` from which they begin."""
+    rng, pasts = torch.Generator().manual_seed(seed), goal.endless.pasts
+    assert pasts is not None
+    for _ in range(BEGINS):
+        stuck = torch.tensor(rehearsal.begin(), dtype=torch.long)
+        if not len(stuck):
+            break
+        where = pasts[stuck, -1:, :2].clone()
+        pasts[stuck] = generator.begin(len(stuck), rng)
+        pasts[stuck, :, :2] += where
+        goal.reset(stuck)
+        env.backend.write(stuck, *goal.start(stuck))
+    return env.observe()
 
 
 class _Seen:
