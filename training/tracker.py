@@ -25,7 +25,7 @@ import contextlib
 from dataclasses import replace
 from pathlib import Path
 
-from poise.body import BodyConfig
+from poise.body import BodyConfig, make_humanoid
 from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
@@ -118,6 +118,15 @@ def finer(tracker: Tracker, options: argparse.Namespace) -> Perpetual:
     )
 
 
+def softer(tracker: Tracker, seconds: float) -> Tracker:
+    """The policy on its body with other contacts, see `BodyTable.soft_s`."""
+    table = tracker.humanoid.table.overridden({"soft_s": seconds})
+    body = tracker.config.body
+    kept = tuple((k, v) for k, v in body.overrides if k != "soft_s")
+    config = replace(tracker.config, body=replace(body, overrides=(*kept, ("soft_s", seconds))))
+    return replace(tracker, humanoid=make_humanoid(tracker.humanoid.skeleton, table), config=config)
+
+
 def parser_of(about: str, minutes: float) -> argparse.ArgumentParser:
     """The options that all trainings of a policy that comes with Poise have."""
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
@@ -146,6 +155,7 @@ def main() -> None:
     parser.add_argument("--pushes", action="store_true", help="see Perpetual.pushes")
     parser.add_argument("--smooth", type=float, default=0.0, help="see PPOConfig.smooth_weight")
     parser.add_argument("--damping", type=float, help="of the servos, kd / kp in s; else the policy's")
+    parser.add_argument("--soft", type=float, help="see BodyTable.soft_s; else the policy's")
     parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")
     parser.add_argument("--samples", type=int, help="control steps at most")
     parser.add_argument("--recovery", type=float, default=0.4)
@@ -160,6 +170,8 @@ def main() -> None:
     earlier = open_run(a.earlier).tracker if a.earlier else None
     if earlier and a.damping:
         earlier = earlier.with_damping(a.damping)
+    if earlier and a.soft:
+        earlier = softer(earlier, a.soft)
     settings = finer(earlier, a) if earlier else config(a.seed, a.paths, a.step or STEP)
     source = str(a.library)
     if a.resume:

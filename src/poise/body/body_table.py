@@ -74,6 +74,10 @@ class BodyRow:
         return tuple(f"{self.name}_{letter.lower()}" for letter in self.order)
 
 
+#: s, MuJoCo's own time constant of contacts.
+HARD_S = 0.02
+
+
 @dataclass(frozen=True)
 class BodyTable:
     """All rows of a humanoid, parents first.
@@ -82,12 +86,14 @@ class BodyTable:
         rows: one per body.
         height_m: m, standing height estimated from the legs.
         friction: sliding friction of the soles.
+        soft_s: s, time constant of contacts (MuJoCo's `solref`): how soft flesh and soles are.
         contact_exclusions: pairs of body names that never collide.
     """
 
     rows: tuple[BodyRow, ...]
     height_m: float
     friction: float = 1.0
+    soft_s: float = HARD_S
     contact_exclusions: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -108,7 +114,7 @@ class BodyTable:
         """The table with values replaced by name: `{"lfoot.kp": 400, "thigh.torque": 250}`.
 
         Keys are `<body>.<field>` with field one of mass, kp, kd, torque, armature, or `<part>.<field>`
-        for all bodies of a part ("thigh.torque"), or "friction".
+        for all bodies of a part ("thigh.torque"), or "friction" or "soft_s".
         """
         table = self
         fields = ("mass", "kp", "kd", "torque", "armature")
@@ -117,8 +123,8 @@ class BodyTable:
                 raise PoiseError(
                     f"'{key}' must be a number of at least 0, got {value}", code="out-of-range"
                 )
-            if key == "friction":
-                table = replace(table, friction=float(value))
+            if key in ("friction", "soft_s"):
+                table = replace(table, **{key: float(value)})
                 continue
             name, _, what = key.rpartition(".")
             kinds = {r.kind for r in table.rows}

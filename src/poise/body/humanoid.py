@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from poise.body.body_table import BodyTable
+from poise.body.body_table import HARD_S, BodyTable
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 
@@ -97,6 +97,10 @@ class Humanoid:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+#: Weight of a softer body where contacts of two things are mixed (MuJoCo's `solmix`).
+SOFTER = 100.0
+
+
 def make_spec(table: BodyTable, count: int = 1) -> mujoco.MjSpec:
     """The `MjSpec` of a humanoid with nothing around it, see `add_humanoid`; or of `count` of them, with
     names that begin with `0/`, `1/`, ..."""
@@ -139,7 +143,7 @@ def add_humanoid(spec: mujoco.MjSpec, table: BodyTable, prefix: str = "") -> Non
                 damping=[row.kd, 0.0, 0.0],
             )
         for i, geom in enumerate(row.geoms):
-            body.add_geom(
+            solid = body.add_geom(
                 name=prefix + (f"{row.name}_{i}" if i else row.name),
                 type=geoms[geom.kind],
                 size=list(geom.size),
@@ -149,6 +153,9 @@ def add_humanoid(spec: mujoco.MjSpec, table: BodyTable, prefix: str = "") -> Non
                 condim=1,
                 friction=[table.friction, 0.1, 0.1],
             )
+            if table.soft_s != HARD_S:
+                # It is as soft on whatever it touches, but for what is softer by itself.
+                solid.solref, solid.solmix = [table.soft_s, 1.0], SOFTER
     for a, b in table.contact_exclusions:
         spec.add_exclude(bodyname1=prefix + a, bodyname2=prefix + b)
     for row in table.rows:

@@ -163,7 +163,7 @@ def stated(texts: tuple[str, ...], kind: type) -> tuple[dict[str, Any], list[str
         name, equals, value = text.partition("=")
         name = name.strip().replace("-", "_")
         if not equals or name.partition(".")[0] not in known:
-            if equals and "." not in name and name != "friction":
+            if equals and "." not in name and name not in ("friction", "soft_s"):
                 hint = did_you_mean(name, sorted(known))
                 raise PoiseError(f"--set has no '{name}'", hint=hint, code="unknown-setting")
             other.append(text)
