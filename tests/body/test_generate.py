@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from poise.body import BodyConfig, Humanoid, generate_table, make_humanoid
+from poise.body.body_table import HARD_S
 from poise.formats import read_clip
 from poise.kinematics import Kinematics, contact_labels, fit_humanoid, lowest_height
 from poise.motion import Clip, trim
@@ -160,6 +161,12 @@ def test_overrides_by_body_and_by_part():
     assert table.rows[table.index("RightFoot")].kp != 400.0
     assert [r.torque for r in table.rows if r.kind == "thigh"] == [99.0, 99.0]
     assert table.overridden({"friction": 0.7}).friction == 0.7
+    # A softer body is so on the floor, too, and is the same body to a checkpoint.
+    soft = make_humanoid(human(), table.overridden({"soft_s": 0.05}))
+    hard = make_humanoid(human(), table)
+    assert soft.identity == hard.identity
+    assert soft.model.geom_solref[:, 0].tolist() == [0.05] * soft.model.ngeom
+    assert (soft.model.geom_solmix > 10).all() and (hard.model.geom_solref[:, 0] == HARD_S).all()
 
 
 @pytest.mark.parametrize(
