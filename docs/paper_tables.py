@@ -290,7 +290,8 @@ _ENDLESS = PaperTable(
             for name, ours in (
                 ("motion without end, ten minutes each", "policy alone, ten minutes each"),
                 ("motion without end, a minute each", "policy alone"),
-                ("with lookahead (ours alone)", "lookahead"),
+                ("futures tried, ten minutes each (ours alone)", "futures tried, ten minutes each"),
+                ("the same with lookahead, a minute each (ours alone)", "lookahead"),
             )
         ),
         Claim("nothing (action 0), which stays down", _STILL, printed="no row"),

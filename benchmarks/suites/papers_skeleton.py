@@ -388,6 +388,8 @@ def staged(places: Places, unit: str) -> Any:
 
 #: Iterations of adaptation of Tables 5 and 6.
 ITERATED = range(8)
+#: Times that each is timed, of which the least counts.
+DRAWS = 3
 
 
 def iterated_units(places: Places) -> list[str]:
@@ -403,9 +405,11 @@ def iterated(places: Places, unit: str) -> Any:
     n, k = map(int, re.findall(r"\d+", unit))
     b = bench(places, n)
     filled(b.test.truth[:1], n, k)
-    begun = time.process_time()
-    made = on_joints(filled(b.test.truth, n, k), b.joints)
-    spent = 1000 * (time.process_time() - begun) / len(b.test.truth)
+    spent = list[float]()
+    for _ in range(DRAWS):
+        begun = time.process_time()
+        made = on_joints(filled(b.test.truth, n, k), b.joints)
+        spent.append(1000 * (time.process_time() - begun) / len(b.test.truth))
     truth, gap = on_joints(b.test.truth, b.joints), slice(PAST, PAST + n)
     pairs = [(m[gap], t[gap]) for m, t in zip(made.pos, truth.pos, strict=True)]
     # Both turns that are the same rotation count as one.
@@ -415,7 +419,7 @@ def iterated(places: Places, unit: str) -> Any:
     return {
         "l2p": [float(l2p(m.double(), t.double(), b.std)) for m, t in pairs],
         "l2q": [float(l2q(m, t)) for m, t in turns],
-        "ms": spent,
+        "ms": min(spent),
     }
 
 
