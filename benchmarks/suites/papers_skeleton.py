@@ -453,6 +453,8 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
             values = np.atleast_1d(np.mean([r[key] for r in own], axis=0))
             # Feet that never touch the floor do not slide.
             values = values[np.isfinite(values)]
+            if not len(values):
+                continue
             error = values.std(ddof=1) / math.sqrt(len(values)) if len(values) > 1 else None
             spread = "" if error is None else f"+- {error:.2g}"
             n = COUNT if error is None else len(values)
