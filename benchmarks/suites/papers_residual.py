@@ -9,6 +9,7 @@ have servos half and twice as stiff (App. C). A training that was stopped goes o
 from __future__ import annotations
 
 import csv
+import math
 import re
 import statistics
 from collections.abc import Iterator
@@ -182,14 +183,16 @@ def rows(places: Places, raws: Raws) -> Iterator[Figure]:
                 raw["thousand_to_deepmimic"] = (first or [raw["curve"][-1][0]])[0] / 1000
         policy = "" if kind == "nothing" else f"{kind} (trained for this table)"
         for key in own[0].keys() - {"starts", "curve"}:
-            values = [float(r[key]) for r in own]
+            values = [float(r[key]) for r in own if math.isfinite(r[key])]
+            if not values:
+                continue
             yield Figure(
                 f"Residual Force Control, Figure 2, {unit}",
                 key,
                 statistics.fmean(values),
                 own[0]["starts"],
                 between(values),
-                len(own),
+                len(values),
                 policy,
             )
         if policy:
