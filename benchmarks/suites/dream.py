@@ -82,8 +82,8 @@ def repeats(humanoid: Humanoid, qpos: np.ndarray, fps: float) -> dict[str, Any]:
 
 
 def visited(humanoid: Humanoid, seeds: Tensor, qpos: np.ndarray, fps: float) -> list[int]:
-    """Which of `seeds (S, p, 7 + n)`, a second of the library each, evenly spread, is the nearest to a
-    motion, of each of its half seconds."""
+    """The nearest of `seeds (S, p, 7 + n)`, a second of the library each, evenly spread, to each half
+    second of a motion."""
     p = seeds.shape[1]
     places = local_places(humanoid, seeds.flatten(0, 1)).unflatten(0, seeds.shape[:2])
     some = places[:, :: p // 5].flatten(1)

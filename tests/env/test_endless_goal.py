@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import Tensor
@@ -13,28 +10,9 @@ from poise.env import ImitationEnv
 from poise.env.generator_goal import GeneratorGoal, Steering
 from poise.env.recovery.recovering import FALLS, RETURNS, TRACKS, Recovering
 from poise.jobs.open import open_run
-from poise.jobs.track.placement import place
-from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.recipes.imitation import Imitation
-
-
-class Stands:
-    """Goes on with the last frame of its past."""
-
-    past, future = 5, 10
-
-    def __init__(self, pose: Tensor):
-        self.pose = pose
-
-    def begin(self, count: int, rng: torch.Generator) -> Tensor:
-        return self.pose.expand(count, self.past, -1).clone()
-
-    def generate(self, past: Tensor, ids: Tensor, rng: torch.Generator) -> Tensor:
-        return past[:, -1:].repeat(1, self.future, 1)
-
-    def rows(self) -> Mapping[str, Tensor]:
-        return {}
+from toy_generator import Stands, endless_task
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +22,7 @@ def tracker() -> Tracker:
 
 @pytest.fixture(scope="module")
 def task(tracker: Tracker) -> Imitation:
-    made = imitation_of(tracker, [place(tracker.example, tracker)])
-    return replace(made, task=replace(made.task, help_by="all"))
+    return endless_task(tracker)
 
 
 def begun(task: Imitation, goal: Recovering) -> tuple[ImitationEnv, Tensor]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -12,24 +11,21 @@ from torch import Tensor
 from poise.env.generator_goal import GeneratorGoal
 from poise.env.recovery.recovering import Recovering
 from poise.jobs.open import open_run
-from poise.jobs.track.placement import place
-from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.plan.rehearsal import Rehearsal
 from poise.recipes.imitation import Imitation
+from toy_generator import Stands, endless_task
 
 
-class Ways:
+class Ways(Stands):
     """Flies off at 5 m/s first of all, and in some other future goes on with the last frame of its past;
     fps 30."""
 
-    past, future = 5, 20
+    future = 20
 
     def __init__(self, pose: Tensor, stands: tuple[bool, ...]):
-        self.pose, self.stands = pose, torch.tensor(stands)
-
-    def begin(self, count: int, rng: torch.Generator) -> Tensor:
-        return self.pose.expand(count, self.past, -1).clone()
+        super().__init__(pose)
+        self.stands = torch.tensor(stands)
 
     def generate(self, past: Tensor, ids: Tensor, rng: torch.Generator) -> Tensor:
         return self.propose(past, rng, 1, ids)[:, 0]
@@ -42,9 +38,6 @@ class Ways:
         made[:, flies, :, 0] += torch.arange(1, self.future + 1) * 5.0 / 30.0
         return made
 
-    def rows(self) -> Mapping[str, Tensor]:
-        return {}
-
 
 @pytest.fixture(scope="module")
 def tracker() -> Tracker:
@@ -53,8 +46,7 @@ def tracker() -> Tracker:
 
 @pytest.fixture(scope="module")
 def task(tracker: Tracker) -> Imitation:
-    made = imitation_of(tracker, [place(tracker.example, tracker)])
-    return replace(made, task=replace(made.task, help_by="all"))
+    return endless_task(tracker)
 
 
 def gone_about(

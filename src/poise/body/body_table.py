@@ -86,15 +86,15 @@ class BodyTable:
         rows: one per body.
         height_m: m, standing height estimated from the legs.
         friction: sliding friction of the soles.
-        soft_s: s, time constant of contacts (MuJoCo's `solref`): how soft flesh and soles are.
         contact_exclusions: pairs of body names that never collide.
+        soft_s: s, time constant of contacts (MuJoCo's `solref`): how soft flesh and soles are.
     """
 
     rows: tuple[BodyRow, ...]
     height_m: float
     friction: float = 1.0
-    soft_s: float = HARD_S
     contact_exclusions: tuple[tuple[str, str], ...] = ()
+    soft_s: float = HARD_S
 
     @property
     def mass(self) -> float:

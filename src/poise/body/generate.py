@@ -120,7 +120,7 @@ def generate_table(
                 geoms=geoms_of(part, ruler),
             )
         )
-    table = BodyTable(tuple(rows), ruler.height, config.friction, contact_exclusions=_exclusions(rows))
+    table = BodyTable(tuple(rows), ruler.height, config.friction, _exclusions(rows))
     return table.overridden(dict(config.overrides))
 
 

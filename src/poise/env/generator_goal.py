@@ -155,7 +155,7 @@ def path_cost(path: WalkPath, along: Tensor, off: Tensor, first: float, fps: flo
 
 @dataclass(frozen=True, eq=False)
 class Futures:
-    """What may follow, in the order in which a generator or the way that is to be gone prefers it.
+    """Motions that may follow, in the order in which a generator or the way to be gone prefers them.
 
     Attributes:
         made: `(K, f, 7 + n)`. along: `(K, f)` m along the path; None where there is none.
@@ -224,7 +224,7 @@ class GeneratorGoal(BufferedGoal):
         self.waits = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self.steps = torch.zeros_like(self.at)
         self.reached, self._passed = list[tuple[int, int]](), torch.zeros_like(self.at)
-        # What was chosen for worlds before it is needed.
+        # Frames that were chosen for worlds before they are needed.
         self._chosen = dict[int, tuple[Tensor, Tensor | None]]()
         self.led = dict[int, Tensor]()
         self.strayed = torch.zeros(num_envs, 4, dtype=torch.float64, device=self.device)
@@ -356,7 +356,7 @@ class GeneratorGoal(BufferedGoal):
         self._known_along[world] = self._along[world]
 
     def futures(self, world: int, count: int, wished: bool = True) -> Futures:
-        """What may follow in a world, at most so many; a generator that proposes none has one.
+        """Motions that may follow in a world, at most so many; a generator that proposes none has one.
 
         wished: as the world wishes, or whatever the generator makes.
         """
@@ -370,7 +370,7 @@ class GeneratorGoal(BufferedGoal):
         return self._preferred(world, past, count, wished)
 
     def choose(self, world: int, futures: Futures, which: int, frames: int) -> None:
-        """So many frames of one of some futures are what follows in a world; what is no motion is left
+        """So many frames of one of some futures follow in a world; frames that are not finite are left
         out."""
         kept = futures.made[which, :frames]
         if bool(kept.isfinite().all()):

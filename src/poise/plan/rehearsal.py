@@ -32,8 +32,9 @@ class Rehearsal:
     A kinematic policy knows nothing of balance. Whenever more frames of a character's motion are needed,
     copies of the character as it stands each follow one of several futures by the policy alone, and the
     first in the generator's own order is taken whose copy stays within `NEAR_M` and ends within `END_M`:
-    what can be done is as likely as it was. Where none does, more are drawn, whatever label the world
-    keeps to; in the end the one that is followed for longest is taken, up to shortly before it is lost.
+    motions that can be done are as likely as they were. If no copy does, more are drawn, whatever label
+    the world keeps to; in the end the one that is followed for longest is taken, up to shortly before it
+    is lost.
 
     Args:
         acts: the controller.
@@ -68,8 +69,9 @@ class Rehearsal:
         return self.acts.act(obs)
 
     def begin(self) -> list[int]:
-        """Chooses anew in worlds that are yet to make their first step and have chosen nothing yet: what
-        they know was made before anything could be tried. Those in which no copy does a future."""
+        """Chooses in worlds that are yet to make their first step, since frames that they know were made
+        before anything could be tried. Gives those in which no copy does a future; they may be chosen
+        for again."""
         goal, env = self._goal, self._env
         assert goal is not None and env is not None
         fresh = [w for w in (env.age == 0).nonzero().squeeze(-1).tolist() if w not in self._begun]
@@ -87,7 +89,7 @@ class Rehearsal:
         snapshot = self._env.snapshot(torch.tensor([world]))
         known, best = int(goal.count[world] - 1 - goal.at[world]), None
         for k in range(ROUNDS):
-            # What the world wishes counts once.
+            # The label that the world keeps to counts once.
             futures = goal.futures(world, self.copies.num_envs, wished=k == 0)
             which, lasts, done = self._tried_out(snapshot, futures, world, goal)
             if done:
@@ -105,7 +107,7 @@ class Rehearsal:
     def _tried_out(
         self, snapshot: Snapshot, futures: Futures, world: int, goal: GeneratorGoal
     ) -> tuple[int, int, bool]:
-        """Which of some futures is to be taken, for how many control steps from now on a copy does it,
+        """The index of the future to be taken, for how many control steps from now on a copy does it,
         and whether that is all."""
         copies = self.copies
         copies.restore(snapshot)
