@@ -34,7 +34,7 @@ from benchmarks.suites.papers_next_frames import (
 )
 from poise.body import BodyConfig, Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.env import Acts, EnvStep, ImitationEnv, Reference
+from poise.env import Acts, EnvStep, ImitationEnv, Reference, TaskConfig
 from poise.env.generator_goal import MotionGenerator
 from poise.jobs.endless.endless_training import codes_of, reach_of
 from poise.jobs.endless.model import Motions, spread
@@ -51,6 +51,7 @@ from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.cvae import CVAEConfig, CVAEObjective, CVAETraining, PackedFrames, make_cvae
 from poise.learn.inbetween_model import InbetweenTrainer
 from poise.motion import ClipLibrary
+from poise.papers.residual_force.dual_policy import DualPolicy, build, dual_task
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task as universal_task
 from poise.recipes.residual_force import task
@@ -200,10 +201,6 @@ WIDTH, BATCH, OUR_BATCH = 128, 32, 64
 MADE = FUTURE + 10
 
 
-#: n of Algorithm 1, and motions that a control policy learns.
-SEGMENTS, MOTIONS = 5, 64
-
-
 #: N and N m, the most help.
 LIMIT = 100.0
 
@@ -216,10 +213,12 @@ NETS = {
 }
 
 
-#: Settings of control policies. EgoPose's sees no reference.
+#: Settings of control policies, all by Algorithm 1 but EgoPose's, which learns recorded motion and sees
+#: no reference.
 CONTROL: dict[str, dict[str, Any]] = {
     "RFC-Explicit": {"method": "rfc-explicit"},
     "RFC-Implicit": {"method": "rfc-implicit"},
+    "RFC-Implicit, force that fades": {"method": "rfc-implicit", "help_limit": 0.0, "help_start": LIMIT},
     "no residual force": {"method": "deepmimic"},
     "no additive action": {"method": "rfc-implicit", "action": "absolute"},
     "EgoPose": {"method": "deepmimic", "action": "absolute"},
@@ -292,55 +291,50 @@ class Control:
     """A control policy with its task.
 
     Attributes:
-        make: the task for motions.
+        make: the task for motions and their z `(N, Z)`.
         policy: acts deterministically.
         limit: N and N m of help.
         samples: control steps that it learned from. seconds: processor time of it.
     """
 
-    make: Callable[[Reference], Imitation]
+    make: Callable[[Reference, Tensor], Imitation]
     policy: Acts
     limit: float
     samples: int = 0
     seconds: float = 0.0
 
 
-def control(name: str, seed: int, tracker: Tracker, motions: list[Tensor], samples: int) -> Control:
-    """A control policy that has learned motions, by RFC's local reward, from nothing or on top of the
-    policy that comes with Poise.
-
-    Episodes begin anywhere in them and end with the root 0.1 m below the lowest of the motion.
-    """
+def control(
+    name: str, seed: int, tracker: Tracker, learned: Kinematic | list[Tensor], samples: int
+) -> Control:
+    """A control policy that has learned a generator by Algorithm 1, from nothing or on top of the policy
+    that comes with Poise; or recorded motions, in which episodes begin anywhere. They end with the root
+    0.1 m below the lowest of the motion."""
     ppo = replace(ResidualForce().ppo, minibatch=512)
     ppo = replace(ppo, std=ON_TOP_STD) if name in ON_TOP else ppo
-    config = ResidualForce(
-        help_limit=LIMIT,
-        help_start=None,
-        reward="local",
-        done="height",
-        expert=False,
-        seed=seed,
-        completion_bonus=False,
-        num_envs=128,
-        sim=tracker.config.sim,
-        ppo=ppo,
-        **(CONTROL | ON_TOP)[name],
-    )
-    own = task(config, tracker.humanoid)
-    if name in ON_TOP:
-        under = universal_task(
-            tracker.config, tracker.humanoid, guided=tracker.recovery_clips is not None
-        )
-        own = replace(own, obs=under.obs, pd=under.pd, left=under.left, window=under.window)
-    if name == "EgoPose":
-        own = replace(own, obs=tuple(t for t in own.obs if not t.name.startswith("target")))
+    stated: dict[str, Any] = {"help_limit": LIMIT} | (CONTROL | ON_TOP)[name]
+    config = DualPolicy(seed=seed, num_envs=128, sim=tracker.config.sim, ppo=ppo, **stated)
+    body, example, rate = tracker.humanoid, tracker.example, tracker.config.sim.control_hz
 
-    def make(reference: Reference) -> Imitation:
-        return _imitation(tracker, reference, config, own)
+    def own(z: Tensor | None) -> TaskConfig:
+        if name == "EgoPose":
+            plain = task(config, body)
+            return replace(plain, obs=tuple(t for t in plain.obs if not t.name.startswith("target")))
+        made = dual_task(config, body, FUTURE, z)
+        if name not in ON_TOP:
+            return made
+        under = universal_task(tracker.config, body, guided=tracker.recovery_clips is not None)
+        seen = {"obs": under.obs, "pd": under.pd, "left": under.left, "window": under.window}
+        return replace(made, events=(), **seen)
 
-    names = [f"motion {k}" for k in range(len(motions))]
-    rate = tracker.config.sim.control_hz
-    imitation = make(Reference(tracker.humanoid, [m.numpy() for m in motions], rate, names))
+    def make(reference: Reference, z: Tensor) -> Imitation:
+        return _imitation(tracker, reference, config, own(z))
+
+    if isinstance(learned, list):
+        names = [f"motion {k}" for k in range(len(learned))]
+        imitation = make(Reference(body, [m.numpy() for m in learned], rate, names), torch.empty(0))
+    else:
+        imitation = replace(build(learned, body, example, config), task=own(None))
     begun = time.process_time()
     env: Any = imitation.env(seed=seed, threads=1, guard=False)
     env = OnTop(env, tracker.policy) if name in ON_TOP else env
@@ -348,11 +342,11 @@ def control(name: str, seed: int, tracker: Tracker, motions: list[Tensor], sampl
     while trainer.samples < samples:
         trainer.iterate()
     trainer.env.close()
-    limit = 0.0 if config.method == "deepmimic" else LIMIT
+    left = float(env.help.now) if config.method != "deepmimic" else 0.0
     seconds = round(time.process_time() - begun, 1)
     policy: Acts = trainer.policy()
     policy = Both(tracker.policy, policy) if name in ON_TOP else policy
-    return Control(make, policy, limit, trainer.samples, seconds)
+    return Control(make, policy, LIMIT * left, trainer.samples, seconds)
 
 
 class OnTop:
@@ -401,7 +395,7 @@ def universal(tracker: Tracker) -> Control:
     """The policy that comes with Poise, without help."""
     own = universal_task(tracker.config, tracker.humanoid, guided=tracker.recovery_clips is not None)
 
-    def make(reference: Reference) -> Imitation:
+    def make(reference: Reference, z: Tensor) -> Imitation:
         return _imitation(tracker, reference, tracker.config, replace(own, help_by="all"))
 
     return Control(make, tracker.policy, 0.0)
@@ -412,7 +406,7 @@ def servos(tracker: Tracker) -> Control:
     config = ResidualForce(method="deepmimic", sim=tracker.config.sim)
     own = task(config, tracker.humanoid)
     return Control(
-        lambda r: _imitation(tracker, r, config, own), Nothing(len(tracker.humanoid.hinges)), 0.0
+        lambda r, z: _imitation(tracker, r, config, own), Nothing(len(tracker.humanoid.hinges)), 0.0
     )
 
 
@@ -430,12 +424,12 @@ class Done(NamedTuple):
     torque: float
 
 
-def simulated(tracker: Tracker, by: Control, pasts: Tensor, futures: Tensor) -> Done:
-    """Futures `(N, MADE, 7 + n)` done from how pasts `(N, p, 7 + n)` end, moving as in their last two
-    frames."""
+def simulated(tracker: Tracker, by: Control, pasts: Tensor, futures: Tensor, z: Tensor) -> Done:
+    """Futures `(N, MADE, 7 + n)` with their z `(N, Z)` done from how pasts `(N, p, 7 + n)` end, moving
+    as in their last two frames."""
     rate = tracker.config.sim.control_hz
     reference = _reference(tracker.humanoid, torch.cat((pasts[:, -1:], futures), 1), rate)
-    env = by.make(reference).env(len(pasts), auto_reset=False, threads=1, guard=False)
+    env = by.make(reference, z).env(len(pasts), None, False, 1, help_scale=by.limit / LIMIT, guard=False)
     every = torch.arange(len(pasts))
     env.reset_to(every, torch.zeros_like(every))
     speed = torch.stack([torch.tensor(qpos_velocity(p[-2:].numpy(), rate)[-1]) for p in pasts])
@@ -452,15 +446,6 @@ def simulated(tracker: Tracker, by: Control, pasts: Tensor, futures: Tensor) -> 
     env.close()
     force, torque = torch.stack(helped).mean(0).tolist() if helped else (0.0, 0.0)
     return Done(torch.stack(out, 1), round(force, 1), round(torque, 1))
-
-
-def imagined(made: MotionGenerator, motions: Motions, seed: int) -> list[Tensor]:
-    """Motions of n segments after pasts of the library, which a control policy learns."""
-    rng = torch.Generator().manual_seed(seed)
-    picks = torch.randint(len(motions.seeds), (MOTIONS,), generator=rng)
-    pasts = motions.seeds[picks].clone()
-    after = continued(made, pasts, SEGMENTS * FUTURE, seed)
-    return list(torch.cat((pasts[:, -1:], after), 1))
 
 
 # --- rows ------------------------------------------------------------------------------------------
@@ -482,7 +467,7 @@ FIXED = ("zero velocity", "acLSTM", "EgoPose", "next frame")
 FALLEN = 0.3
 
 
-#: The dual policy, whose control policy does not see z, against which the others are compared.
+#: The dual policy, against which the others are compared.
 OURS = "RFC-Implicit"
 
 
@@ -490,6 +475,7 @@ ALL = (
     "zero velocity",
     "ours",
     OURS,
+    "RFC-Implicit, force that fades",
     "RFC-Explicit",
     "EgoPose",
     "ERD",
@@ -578,6 +564,15 @@ class Rows:
             return pasts[:, -1:].expand(-1, MADE, -1)
         return continued(self.network(method).made, pasts, MADE, self.unit.seed)
 
+    def _latents(self, pasts: Tensor) -> Tensor:
+        """z `(N, Z)` of the futures that `ours` makes of pasts."""
+        made = self.network("ours").made
+        assert isinstance(made, Kinematic)
+        kept, rng = made.remembering(len(pasts)), torch.Generator().manual_seed(self.unit.seed)
+        kept.generate(pasts, torch.arange(len(pasts)), rng)
+        assert kept.latent is not None
+        return kept.latent
+
     def row(self, method: str) -> tuple[dict[str, Any], np.ndarray]:
         """A row, and its distances `(W, S, f)`."""
         about: dict[str, Any] = {"method": method, **self.unit._asdict()}
@@ -592,7 +587,7 @@ class Rows:
             by = self._control(method)
             source = "EgoPose" if method == "EgoPose" else "ours"
             pasts = self._pasts(source)
-            done = simulated(self.tracker, by, pasts, self.futures(source))
+            done = simulated(self.tracker, by, pasts, self.futures(source), self._latents(pasts))
             qpos = done.qpos
             about |= {
                 "body": True,
@@ -612,9 +607,7 @@ class Rows:
             return servos(self.tracker)
         if method == "universal policy":
             return universal(self.tracker)
-        learned = self.recorded
-        if method != "EgoPose":
-            learned = imagined(self.network("ours").made, self.motions, self.unit.seed)
+        learned: Any = self.recorded if method == "EgoPose" else self.network("ours").made
         samples = self.samples // 3 if method in ON_TOP else self.samples
         return control(method, self.unit.seed, self.tracker, learned, samples)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from poise.env.generator_goal import GeneratorGoal
 from poise.env.recovery.recovering import Recovering
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.plan.rehearsal import Rehearsal
+from poise.plan.rehearsal import FutureTrials, Rehearsal
 from poise.recipes.imitation import Imitation
 from toy_generator import Stands, endless_task
 
@@ -66,7 +67,7 @@ def gone_about(
     env = task.env(1, None, False, 1, help_scale=0.0)
     copies = task.bare().env(tries, None, False, 1, help_scale=0.0, guard=False)
     copies.set_goal(tried := goal(tries, False))
-    acts = Rehearsal(tracker.policy, tracker.policy, copies, tried)
+    acts = Rehearsal(tracker.policy, FutureTrials(tracker.policy, copies, tried.endless))
     acts.watch(env, own)
     env.backend.write(None, *own.start(None))
     env.age[:] = 0
@@ -109,3 +110,25 @@ def test_what_is_no_motion_is_left_to_the_goal(tracker: Tracker, task: Imitation
     assert motion.due() == []
     motion.aim(None, None)
     assert int(motion.count[0]) == Ways.past + 7
+
+
+def test_copies_stand_where_a_past_ends(tracker: Tracker, task: Imitation) -> None:
+    assert tracker.recovery_clips is not None
+    past = tracker.recovery_clips.ease.double().repeat(Ways.past, 1)
+    past[:, :2] += torch.tensor([3.0, -2.0])
+    copies = task.bare().env(3, None, False, 1, help_scale=0.0, guard=False)
+    motion = GeneratorGoal(Ways(past[0], (True,)), task.humanoid, 30.0, 3, lead=4, plans=False)
+    motion.reset(torch.arange(3))
+    copies.set_goal(motion)
+    trials = FutureTrials(tracker.policy, copies, motion)
+    ways = Ways(past[0], (False, False, True))
+
+    def futures(k: int) -> Tensor:
+        return ways.propose(past[None], torch.Generator(), 3)[0]
+
+    found = trials.find(futures, partial(trials.stand, past))
+    assert found == (0, 2, Ways.future, True)
+    # It stood there, and does so again after it has gone elsewhere.
+    assert float((copies.pose().pos[2, 0, :2] - past[0, :2].float()).norm()) < 0.1
+    assert trials.find(futures, partial(trials.stand, past)) == found
+    copies.close()

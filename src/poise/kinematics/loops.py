@@ -204,7 +204,9 @@ def _even(clip: Clip, k: int, period: int) -> Clip:
 
 #: A loop may last this share longer or shorter than asked; s in which its end becomes its start; s by
 #: which a difference of speeds counts as one of places.
-LENIENT, JOINS_S, SPEED_S = 0.1, 0.6, 0.15
+LENIENT, JOINS_S, SPEED_S = 0.1, (0.6, 0.4, 0.9), 0.15
+#: Pairs of frames whose loops are compared by their jerk.
+PAIRS = 24
 
 
 def cut_loop(
@@ -215,7 +217,9 @@ def cut_loop(
     Frames i and j are alike where places and speeds of all joints are, seen from the root's heading and
     place on the floor. Up to frame j the motion passes over into that up to frame i, set on its heading
     and place, with a share s as smooth as s'' = 0 at both ends. So the last frame is the first one, a
-    turn and a way on the floor later, at the same speed.
+    turn and a way on the floor later, at the same speed. Of the pairs that are most alike, the first is
+    taken whose passage has no more jerk than the rest of its loop, else that with the least in
+    proportion.
 
     Args:
         seconds: of the loop; it may last a tenth longer or shorter.
@@ -228,7 +232,7 @@ def cut_loop(
         PoiseError: the motion holds no part that is long enough.
     """
     fps, pos = clip.fps, clip.positions()
-    joins, wanted = max(2, round(JOINS_S * fps)), seconds * fps
+    joins, wanted = [max(2, round(s * fps)) for s in JOINS_S], seconds * fps
     near = _from_root(clip, pos)
     speed = np.gradient(near, 1.0 / fps, axis=0) * SPEED_S
     # The root's way on the floor is no difference of places, but one of speeds.
@@ -241,23 +245,36 @@ def cut_loop(
         kept[max(0, math.floor(start * fps)) : math.ceil(stop * fps) + 1] = False
     # Frames since the last one that is not to be in it.
     free = np.arange(clip.frames) - np.maximum.accumulate(np.where(kept, -1, np.arange(clip.frames)))
-    best: tuple[float, int, int] | None = None
+    pairs: list[tuple[float, int, int]] = []
     for length in range(math.ceil((1 - LENIENT) * wanted), math.floor((1 + LENIENT) * wanted) + 1):
-        ends = np.flatnonzero(free > length + joins)
-        if not len(ends) or length <= joins:
+        ends = np.flatnonzero(free > length + max(joins))
+        if not len(ends) or length <= max(joins):
             continue
         gap = np.square(alike[ends] - alike[ends - length]).mean(1)
-        k = int(gap.argmin())
-        if best is None or gap[k] < best[0]:
-            best = float(gap[k]), int(ends[k]) - length, int(ends[k])
-    if best is None:
+        some = gap.argsort(kind="stable")[:PAIRS]
+        pairs += [(float(gap[k]), int(ends[k]) - length, int(ends[k])) for k in some]
+    if not pairs:
         raise PoiseError(
             f"the motion of {clip.frames / fps:.1f} s holds no {seconds:g} s in a row for a loop",
             clip.name,
             "Make a longer one, or ask for a shorter loop",
             code="clip-too-short",
         )
-    _, i, j = best
+    best: tuple[float, Clip, float] | None = None
+    for _, i, j in sorted(pairs)[:PAIRS]:
+        for frames in joins:
+            made = _joined(clip, i, j, frames)
+            seam = _seam(made, frames)
+            if best is None or seam < best[0]:
+                best = seam, made, float(np.linalg.norm(near[i] - near[j], axis=-1).mean())
+            if seam <= 1.0:
+                return made, best[2]
+    assert best is not None
+    return best[1:]
+
+
+def _joined(clip: Clip, i: int, j: int, joins: int) -> Clip:
+    """Frames i to j as a cycle, the last `joins` of which pass over into those up to frame i."""
     here, before = np.arange(i, j + 1), np.arange(j - joins, j + 1) - (j - i)
     first, last = (clip.rot[k, 0] for k in (i, j))
     onto = quat_mul(heading_quat(last), quat_conj(heading_quat(first)))
@@ -272,8 +289,13 @@ def cut_loop(
     tail = slice(-joins - 1, None)
     root[tail] += share * (along - root[tail])
     rot[tail] = slerp(rot[tail], turned, np.broadcast_to(share, rot[tail].shape[:2]))
-    apart = float(np.linalg.norm(near[i] - near[j], axis=-1).mean())
-    return clip.replaced(root_pos=root, rot=rot, cyclic=True), apart
+    return clip.replaced(root_pos=root, rot=rot, cyclic=True)
+
+
+def _seam(loop: Clip, joins: int) -> float:
+    """The mean jerk of a loop's last `joins` frames as a share of that of the others."""
+    shake = np.linalg.norm(np.diff(loop.positions(), 3, axis=0), axis=-1).mean(-1)
+    return float(shake[-joins:].mean() / max(float(shake[:-joins].mean()), 1e-12))
 
 
 def _from_root(clip: Clip, pos: np.ndarray) -> np.ndarray:

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from poise.env.recovery.recovering import RecoveryPhases
 from poise.live.people import Offset
 from poise.metrics import LOST
 from poise.motion.rotations import facing, heading_angle
+from poise.plan.rehearsal import FutureTrials
 from poise.synthesis.generator import Kinematic
 
 #: s in which one motion passes into another at least; m/s^2 with which the root speeds up at most, on
@@ -145,10 +147,19 @@ class EndlessCoords:
         generator: makes them.
         seed: of its draws.
         executor: makes them beside the loop; None makes them at once, as tests do.
+        trials: gives copies of the character in which futures are tried before one is taken, see
+            `plan.rehearsal`; they begin as the motion does, since where the character will be by then is
+            not known. None takes futures as they are made.
     """
 
-    def __init__(self, generator: Kinematic, seed: int = 0, executor: Executor | None = None):
-        self._generator, self._executor = generator, executor
+    def __init__(
+        self,
+        generator: Kinematic,
+        seed: int = 0,
+        executor: Executor | None = None,
+        trials: Callable[[], FutureTrials] | None = None,
+    ):
+        self._generator, self._executor, self._trials = generator, executor, trials
         self._rng = torch.Generator().manual_seed(seed)
         self._past = generator.begin(1, self._rng)
         self._frames = deque[np.ndarray]()
@@ -202,14 +213,28 @@ class EndlessCoords:
         return torch.from_numpy(self._where.back(found)[:, :2].copy())
 
     def _make(self, others: Sequence[Tensor]) -> Tensor:
+        here, keeps = self._past[0, -1, :2], self._generator.future
+        near = any(float((o - here).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
+        if near:
+            # The others may turn meanwhile: half of it is done before more is made.
+            keeps = -(-keeps // 2)
+        if self._trials is None:
+            return self._futures(SOME if near else 1, near, others)[None, 0, :keeps]
+        trials, drawn = self._trials(), list[Tensor]()
+
+        def futures(k: int) -> Tensor:
+            many = SOME if near else len(trials)
+            drawn.append(self._futures(many, near, others)[: len(trials), :keeps])
+            return drawn[k]
+
+        found = trials.find(futures, partial(trials.stand, self._past[0]))
+        return drawn[found.drawn][None, found.which, : found.frames]
+
+    def _futures(self, count: int, near: bool, others: Sequence[Tensor]) -> Tensor:
+        """`(count, f, 7 + n)`, those that keep away from the others first, where they are near."""
         one = torch.zeros(1, dtype=torch.long)
-        here = self._past[0, -1, :2]
-        if not any(float((o - here).norm(dim=-1).amin()) < IN_THE_WAY for o in others):
-            return self._generator.generate(self._past, one, self._rng)
-        made = self._generator.propose(self._past, self._rng, SOME, one)[0]
-        best = int(cost_of(made[..., :2], None, others).argmin())
-        # The others may turn meanwhile: half of it is done before more is made.
-        return made[None, best, : -(-self._generator.future // 2)]
+        made = self._generator.propose(self._past, self._rng, count, one)[0]
+        return made[cost_of(made[..., :2], None, others).argsort(stable=True)] if near else made
 
 
 #: What a character does.

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from poise.jobs.endless.dreaming import trials_of
 from poise.live.characters import FALLS, RETURNS, EndlessCoords, tensor
 from poise.live.people import Own, People, calibrated
 from poise.live.protocol import LiveConfig
 from poise.live.stream import margin
 from poise.live.world import LiveWorld
+from poise.plan.rehearsal import FutureTrials
 from poise.synthesis.generator import Kinematic
 
 #: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
@@ -22,6 +24,8 @@ from poise.synthesis.generator import Kinematic
 CATCHES_UP, GIVES_UP_S = 0.15, 1.5
 #: s in which errors wander.
 WANDERS_S = 0.3
+#: Futures of endless motion that are tried at once.
+TRIES = 6
 
 
 class Targets:
@@ -167,4 +171,10 @@ class Targets:
             self.endless.pop(k, None)
         elif self.generator is not None and k not in self.endless:
             seed = int(self.rng.integers(2**31))
-            self.endless[k] = EndlessCoords(self.generator, seed, self._executor)
+            self.endless[k] = EndlessCoords(self.generator, seed, self._executor, lambda: self._trials)
+
+    @cached_property
+    def _trials(self) -> FutureTrials:
+        """Copies in which all characters try, one after another; made beside the loop."""
+        assert self.generator is not None
+        return trials_of(self.world.tracker, self.generator, TRIES)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from poise.machine import one_thread
 from poise.metrics import has_lost
 
 if TYPE_CHECKING:
-    from poise.env.env import ImitationEnv, Snapshot
+    from poise.env.env import ImitationEnv
     from poise.env.generator_goal import Futures, GeneratorGoal
     from poise.env.recovery.recovering import Recovering
     from poise.env.task import Acts
@@ -23,6 +24,89 @@ NEAR_M, END_M = 0.25, 0.15
 ROUNDS = 8
 #: Frames before a copy has lost a future that are left out where no copy does one, and the fewest kept.
 SAFE, FEWEST = 15, 10
+
+
+class TriedFuture(NamedTuple):
+    """A future that is to be taken.
+
+    Attributes:
+        drawn: how often futures were drawn before. which: of those of the last time. frames: of it that
+            are to be taken. done: whether a copy does them.
+    """
+
+    drawn: int
+    which: int
+    frames: int
+    done: bool
+
+
+class FutureTrials:
+    """Copies of a character, each of which follows one of several futures by the policy alone.
+
+    Args:
+        policy: acts in the copies.
+        copies: an environment of as many worlds as futures are tried: without ends and automatic
+            restarts (`Imitation.bare`).
+        tried: what the copies follow, a generator that makes no frames there.
+    """
+
+    def __init__(self, policy: Acts, copies: ImitationEnv, tried: GeneratorGoal):
+        self.policy, self.copies, self.tried = policy, copies, tried
+        self._every = torch.arange(copies.num_envs)
+
+    def __len__(self) -> int:
+        return len(self._every)
+
+    def stand(self, past: Tensor) -> None:
+        """Every copy stands where a past `(p, 7 + n)` ends, moving as it does."""
+        self.tried.begin_from(self._every, past.expand(len(self), -1, -1))
+        self.tried.at[:] = len(past) - 1
+        self.copies.backend.write(None, *self.tried.start(None))
+        self.copies.age[:], self.copies.action[:] = 0, 0.0
+
+    @one_thread()
+    def find(self, futures: Callable[[int], Tensor], begin: Callable[[], None]) -> TriedFuture:
+        """Tries futures until one is done, and the first of those that were drawn together is taken. If
+        none is in `ROUNDS`, the one that is followed for longest is, up to shortly before it is lost.
+
+        Args:
+            futures: draws some `(K, f, 7 + n)`, told how often they were drawn before.
+            begin: sets the copies and their goals on where the character is.
+        """
+        best: TriedFuture | None = None
+        for k in range(ROUNDS):
+            made = futures(k)
+            begin()
+            which, frames, done = self._attempt(made)
+            if done:
+                return TriedFuture(k, which, made.shape[1], True)
+            if best is None or frames > best.frames:
+                best = TriedFuture(k, which, frames, False)
+        assert best is not None
+        return best._replace(frames=max(FEWEST, best.frames - SAFE))
+
+    def _attempt(self, made: Tensor) -> tuple[int, int, bool]:
+        """Which of the futures `(K, f, 7 + n)` is the first that is done, else is followed for longest;
+        so many of its frames; and whether it is done to its end."""
+        copies, tried, every = self.copies, self.tried, self._every
+        known = int(tried.count[0] - 1 - tried.at[0])
+        tried.extend(every, made[every % len(made)])
+        tried.aim(None, None)
+        obs = copies.observe()
+        # The last frame has no next one yet.
+        steps = known + made.shape[1] - 1
+        lasts, off = torch.full((len(every),), steps), torch.zeros(len(every))
+        for k in range(steps):
+            obs = copies.step(self.policy.act(obs)).final_obs
+            pos, aim = copies.pose().pos, copies.goal_pose().pos
+            off = (pos - aim).norm(dim=-1).mean(-1).nan_to_num(torch.inf)
+            lost = has_lost(pos, aim) | (off > NEAR_M)
+            lasts = torch.where(lost & (lasts == steps), k, lasts)
+            if bool((lasts < steps).all()):
+                break
+        steady = (lasts == steps) & (off <= END_M)
+        which = int(steady.float().argmax()) if bool(steady.any()) else int(lasts.argmax())
+        return which % len(made), int(lasts[which]) - known, bool(steady[which])
 
 
 class Rehearsal:
@@ -38,17 +122,14 @@ class Rehearsal:
 
     Args:
         acts: the controller.
-        policy: acts in the copies.
-        copies: an environment of the same body and kind of goal, of as many worlds as futures are tried:
-            without ends and automatic restarts (`Imitation.bare`).
-        tried: what the copies follow, a generator that makes no frames there.
+        trials: copies of the same body and kind of goal.
 
     Attributes:
         chosen: how often the generator's first future was taken, another one, and one that is lost.
     """
 
-    def __init__(self, acts: Acts, policy: Acts, copies: ImitationEnv, tried: Recovering):
-        self.acts, self.policy, self.copies, self.tried = acts, policy, copies, tried.endless
+    def __init__(self, acts: Acts, trials: FutureTrials):
+        self.acts, self.trials = acts, trials
         self.chosen = [0, 0, 0]
         self._env: ImitationEnv | None = None
         self._goal: GeneratorGoal | None = None
@@ -83,50 +164,22 @@ class Rehearsal:
         goal.aim(None, None)
         return stuck
 
-    @one_thread()
     def _choose(self, world: int, goal: GeneratorGoal) -> bool:
         assert self._env is not None
-        snapshot = self._env.snapshot(torch.tensor([world]))
-        known, best = int(goal.count[world] - 1 - goal.at[world]), None
-        for k in range(ROUNDS):
-            # The label that the world keeps to counts once.
-            futures = goal.futures(world, self.copies.num_envs, wished=k == 0)
-            which, lasts, done = self._tried_out(snapshot, futures, world, goal)
-            if done:
-                goal.choose(world, futures, which, goal.keeps)
-                self.chosen[0 if k == which == 0 else 1] += 1
-                return True
-            if best is None or lasts > best[2]:
-                best = futures, which, lasts
-        assert best is not None
-        futures, which, lasts = best
-        self.chosen[2] += 1
-        goal.choose(world, futures, which, max(FEWEST, min(goal.keeps, lasts - known - SAFE)))
-        return False
+        trials, snapshot = self.trials, self._env.snapshot(torch.tensor([world]))
+        drawn: list[Futures] = []
 
-    def _tried_out(
-        self, snapshot: Snapshot, futures: Futures, world: int, goal: GeneratorGoal
-    ) -> tuple[int, int, bool]:
-        """The index of the future to be taken, for how many control steps from now on a copy does it,
-        and whether that is all."""
-        copies = self.copies
-        copies.restore(snapshot)
-        every = torch.arange(copies.num_envs)
-        # Frames that a copy's own goal may have made are no part of it.
-        self.tried.count[:], self.tried.low[:] = goal.count[world], goal.low[world]
-        self.tried.extend(every, futures.made[every % len(futures), : goal.keeps])
-        self.tried.aim(None, None)
-        obs = copies.observe()
-        steps = int(self.tried.count[0] - self.tried.at[0]) - 2
-        lasts, off = torch.full((len(every),), steps), torch.zeros(len(every))
-        for k in range(steps):
-            obs = copies.step(self.policy.act(obs)).final_obs
-            pos, aim = copies.pose().pos, copies.goal_pose().pos
-            off = (pos - aim).norm(dim=-1).mean(-1).nan_to_num(torch.inf)
-            lost = has_lost(pos, aim) | (off > NEAR_M)
-            lasts = torch.where(lost & (lasts == steps), k, lasts)
-            if bool((lasts < steps).all()):
-                break
-        steady = (lasts == steps) & (off <= END_M)
-        which = int(steady.float().argmax()) if bool(steady.any()) else int(lasts.argmax())
-        return which % len(futures), int(lasts[which]), bool(steady[which])
+        def futures(k: int) -> Tensor:
+            # The label that the world keeps to counts once.
+            drawn.append(goal.futures(world, len(trials), wished=k == 0))
+            return drawn[k].made[:, : goal.keeps]
+
+        def begin() -> None:
+            trials.copies.restore(snapshot)
+            # Frames that a copy's own goal may have made are no part of it.
+            trials.tried.count[:], trials.tried.low[:] = goal.count[world], goal.low[world]
+
+        found = trials.find(futures, begin)
+        goal.choose(world, drawn[found.drawn], found.which, found.frames)
+        self.chosen[2 if not found.done else 0 if found.drawn == found.which == 0 else 1] += 1
+        return found.done

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from poise.body import BodyConfig, BodyTable, Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
+from poise.env.goal import Goal
 from poise.env.recovery.get_up import RecoveryClips
 from poise.errors import PoiseError
 from poise.kinematics import FitReport, fit_humanoid
@@ -82,6 +84,7 @@ class Imitation:
             `papers.compliant.opponents` moves.
         links, touches, floor: of such worlds, see `Scene`; the character's bodies have their own names.
         physics: a model in place of the body's own on a floor, such as a heavier one; without props.
+        goal: makes what so many worlds follow in place of the reference, by a seed.
     """
 
     library: ClipLibrary
@@ -96,6 +99,7 @@ class Imitation:
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
     floor: Floor = field(default_factory=Plane)
+    goal: Callable[[int, int], Goal] | None = None
 
     def __repr__(self) -> str:
         clips, seconds = len(self.library), self.library.seconds
@@ -132,7 +136,8 @@ class Imitation:
         seed = int(self.config.seed if seed is None else seed)
         task, substeps = replace(self.task, auto_reset=auto_reset), self.config.sim.substeps
         watch = NanGuard(backend, dumps, seed=seed) if guard else None
-        env = ImitationEnv(self.reference, backend, task, substeps, seed, guard=watch)
+        goal = self.reference if self.goal is None else self.goal(backend.num_envs, seed)
+        env = ImitationEnv(goal, backend, task, substeps, seed, guard=watch)
         if watch is not None:
             watch.where = env.where
         env.help.set(help_scale)

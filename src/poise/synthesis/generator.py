@@ -230,6 +230,8 @@ class Kinematic:
         bounds: `(2, n)` rad, least and most of each hinge; None leaves angles as they are made.
         codes: from which z is drawn; None draws it from N(0, temperature^2), as the paper does.
         wishes: what labels worlds keep to for a while; None leaves that to chance, see `wishing`.
+        latent: `(N, Z)`, into which z of each world's last segment is written, as a control policy sees
+            it in Algorithm 1; None keeps none.
     """
 
     def __init__(
@@ -241,6 +243,7 @@ class Kinematic:
         bounds: Tensor | None = None,
         codes: Codes | None = None,
         wishes: Wishes | None = None,
+        latent: Tensor | None = None,
     ):
         if seeds.ndim != 3 or seeds.shape[1] != net.config.past or not len(seeds):
             raise PoiseError(
@@ -254,16 +257,20 @@ class Kinematic:
             )
         self.net, self.seeds, self.fps = net.eval(), seeds.double(), fps
         self.temperature, self.bounds, self.codes, self.wishes = temperature, bounds, codes, wishes
-        self.past, self.future = net.config.past, net.config.future
+        self.latent, self.past, self.future = latent, net.config.past, net.config.future
+
+    def remembering(self, worlds: int) -> Kinematic:
+        """The same for some worlds, of each of which it keeps z of the last segment, see `latent`."""
+        own = self.net, self.seeds, self.fps, self.temperature, self.bounds, self.codes
+        return Kinematic(*own, self.wishes, torch.zeros(worlds, self.net.config.latent))
 
     def wishing(self, seconds: float, worlds: int = 1) -> Kinematic:
         """The same for some worlds, each of which keeps to a label of the library for some seconds, on
         average, and then turns to another one; no seconds or no labels leave that to chance."""
         segments = seconds * self.fps / self.future
         wishes = Wishes.among(self.codes, segments, worlds) if seconds > 0 else None
-        return Kinematic(
-            self.net, self.seeds, self.fps, self.temperature, self.bounds, self.codes, wishes
-        )
+        own = self.net, self.seeds, self.fps, self.temperature, self.bounds, self.codes
+        return Kinematic(*own, wishes, self.latent)
 
     def begin(self, count: int, rng: torch.Generator) -> Tensor:
         """`(count, past, 7 + n)` of the seeds, drawn evenly, set to the origin."""
@@ -287,7 +294,10 @@ class Kinematic:
         usual = -(-count // USUAL)
         kinds = -(-(count - usual) // BENDS)
         frames = own.repeat_interleave(usual + kinds, 0)
-        made = self.net.continued(frames, self._codes(own, usual, kinds, rng, ids)).double()
+        codes = self._codes(own, usual, kinds, rng, ids)
+        if self.latent is not None and ids is not None and count == 1:
+            self.latent[ids] = codes
+        made = self.net.continued(frames, codes).double()
         made = made.unflatten(0, (len(past), -1))
         bend = torch.linspace(-BEND, BEND, BENDS).double().repeat(kinds)[: count - usual]
         bent = made[:, usual:].repeat_interleave(BENDS, 1)[:, : count - usual].clone()
@@ -317,8 +327,9 @@ class Kinematic:
         return torch.cat([z.unflatten(0, (len(past), -1)) for z in parts], 1).flatten(0, 1)
 
     def rows(self) -> Mapping[str, Tensor]:
-        """What worlds wish; else it remembers nothing but the past that it is given."""
-        return {} if self.wishes is None else self.wishes.rows()
+        """What worlds wish, and z; else it remembers nothing but the past that it is given."""
+        kept = {} if self.latent is None else {"latent": self.latent}
+        return kept | ({} if self.wishes is None else self.wishes.rows())
 
     def endless(self, frames: int, rng: torch.Generator, past: Tensor | None = None) -> Tensor:
         """`(past + frames, 7 + n)` of one motion without physics, its own past again and again.

@@ -45,7 +45,7 @@ from poise.kinematics.travel import find_travel, travelled
 from poise.learn.run import interruptible
 from poise.metrics import help_audit
 from poise.motion import Clip
-from poise.plan.rehearsal import Rehearsal
+from poise.plan.rehearsal import FutureTrials, Rehearsal
 from poise.recipes.imitation import Imitation
 from poise.score import simulate
 from poise.score.card import NO_HELP, Help
@@ -267,7 +267,7 @@ def _go_about(
         if ahead is not None:
             ahead.copies.close()
         if rehearsal is not None:
-            rehearsal.copies.close()
+            rehearsal.trials.copies.close()
     return own
 
 
@@ -288,7 +288,21 @@ def rehearsed(
         unforeseen(task).bare().env(tries, None, False, threads, help_scale=helped(task), guard=False)
     )
     copies.set_goal(tried := goal(tries, False))
-    return Rehearsal(acts, tracker.policy, copies, tried)
+    return Rehearsal(acts, FutureTrials(tracker.policy, copies, tried.endless))
+
+
+def trials_of(tracker: Tracker, generator: Kinematic, tries: int) -> FutureTrials:
+    """Copies of a policy's character alone, in which so many futures are tried at once."""
+    task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
+    copies = task.env(tries, None, False, 1, help_scale=0.0, guard=False)
+    lead = max(*tracker.config.window, 1) + 1
+    rate = tracker.config.sim.control_hz
+    # What copies begin with is replaced, and wishes are those of other worlds.
+    begins = generator.wishing(0.0)
+    goal = GeneratorGoal(begins, tracker.humanoid, rate, tries, lead=lead, plans=False)
+    goal.reset(torch.arange(tries))
+    copies.set_goal(goal)
+    return FutureTrials(tracker.policy, copies, goal)
 
 
 #: Pasts that are drawn until a copy of a character can go on from one.
