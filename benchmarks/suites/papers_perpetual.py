@@ -31,7 +31,7 @@ from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.recipes.perpetual import build
 from poise.recipes.residual_force_settings import ResidualForce
 
-SAMPLES, SEEDS = 2_000_000, (0, 1)
+SAMPLES, SEEDS = 500_000, (0, 1)
 #: The library: walks, runs and jumps of five subjects.
 FOLDERS = ("cmu_amc/02", "cmu_amc/35", "cmu_amc/39", "deepmimic_txt")
 
