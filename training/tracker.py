@@ -104,6 +104,7 @@ def finer(tracker: Tracker, options: argparse.Namespace) -> Perpetual:
         kept,
         heading="hips" if a.hips else kept.heading,
         filter=a.filter,
+        interpolate=a.interpolate or kept.interpolate,
         window=(2, 4, 8),
         root=0.2,
         action_rate=3.0,
@@ -147,6 +148,7 @@ def main() -> None:
     parser.add_argument("--step", type=float, help=f"{STEP:g} from nothing, else 1e-4")
     parser.add_argument("--std", type=float, default=0.05)
     parser.add_argument("--filter", type=float, default=0.0)
+    parser.add_argument("--interpolate", action="store_true", help="see Perpetual.interpolate")
     parser.add_argument("--hips", action="store_true")
     parser.add_argument("--acceleration", type=float, default=0.0, help="price of rough motion")
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")

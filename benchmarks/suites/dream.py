@@ -221,7 +221,7 @@ def rollouts(
     finally:
         env.close()
         if tried is not None:
-            tried.copies.close()
+            tried.trials.copies.close()
     told(out, goal)
     return out
 

@@ -187,3 +187,33 @@ def test_a_push_from_the_front_goes_against_where_one_faces(task: Imitation) -> 
 def test_mistakes(settings: dict, message: tuple) -> None:
     with refused(*message):
         Pushes(**settings)
+
+
+class SeenTargets(Event):
+    """Keeps the joints' targets of every physics step."""
+
+    def __init__(self) -> None:
+        self.seen = list[torch.Tensor]()
+
+    def before_step(self, drive: Drive) -> bool:
+        return True
+
+    def before_substep(self, drive: Drive) -> None:
+        self.seen.append(drive.ctrl.clone())
+
+
+def test_targets_go_evenly_from_the_last_to_the_new_ones(task: Imitation) -> None:
+    seen = SeenTargets()
+    smooth = replace(task, task=replace(task.task, pd=replace(task.task.pd, interpolate=True)))
+    env = pushed(smooth, lambda goal, backend: seen).env(2, 1, False, threads=1)
+    zero, of = torch.zeros(2, dtype=torch.long), task.config.sim.substeps
+    env.reset_to(zero, zero)
+    for _ in range(3):
+        env.step(torch.randn(2, env.num_actions))
+    targets = torch.stack(seen.seen).unflatten(0, (3, of))
+    # There are none before the first ones.
+    torch.testing.assert_close(targets[0], targets[0, -1].expand(of, -1, -1))
+    for k in range(of):
+        expected = torch.lerp(targets[:-1, -1], targets[1:, -1], (k + 1) / of)
+        torch.testing.assert_close(targets[1:, k], expected)
+    env.close()

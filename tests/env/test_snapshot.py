@@ -51,6 +51,7 @@ TASKS: dict[str, Callable[[], Imitation]] = {
     "shapes": lambda: perpetual(shapes=BodyShapes(count=3), recovery=False),
     "keypoints": lambda: perpetual(goal="keypoints"),
     "additive": lambda: perpetual(action="additive", style=None),
+    "interpolated": lambda: perpetual(action="additive", style=None, interpolate=True),
     "filtered": lambda: perpetual(filter=0.6, window=(2, 4), root=0.2, foot_slide=0.1, **RATES),
 }
 

@@ -21,11 +21,15 @@ class PDTargets(Checked):
             u = offset + scale * a (RFC Sec. 3).
         scale: rad per unit of action, one for all hinges or `(n)`, see `range_scale`.
         offset: `(n)` rad, used by "absolute" only (zeros if None, as in PHC).
+        interpolate: targets go evenly from the last ones to the new ones over the physics steps of a
+            control step, u_k = u_before + (k / K) (u - u_before), k = 1 ... K (a first-order hold);
+            without, the new ones act at once (a zero-order hold).
     """
 
     mode: Literal["additive", "absolute"] = "additive"
     scale: float | Tensor = 1.0
     offset: Tensor | None = None
+    interpolate: bool = False
 
     def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""

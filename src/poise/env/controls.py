@@ -58,6 +58,8 @@ class Actuation:
         self._places = torch.tensor([b + 1 for b in self.bodies], device=backend.device)
         # One for characters with help, one for those without.
         self.functions: dict[bool, TensorFunction] = {}
+        # Where targets are interpolated, those at the end of the last control step.
+        self.before_targets = torch.zeros_like(backend.drive.ctrl)
 
     def apply(
         self, action: Tensor, targets: Tensor, rows: Tensor, scale: Tensor, helped: bool
@@ -97,16 +99,27 @@ class Actuation:
         drive = self.backend.drive
         return drive.ctrl.clone(), drive.qfrc_applied.clone(), drive.xfrc_applied.clone()
 
-    def substep(self, held: tuple[Tensor, ...] | None) -> None:
-        """Adds the forces of events that are told anew before each physics step to what was `held`;
-        None where that is in the drive already."""
+    def substep(self, held: tuple[Tensor, ...], k: int, of: int) -> None:
+        """Makes the drive what it is in physics step k `of` so many: what was `held`, with targets on
+        their way and with the forces of events that are told anew."""
         drive = self.backend.drive
-        if held is not None:
+        if k:
             parts = drive.ctrl, drive.qfrc_applied, drive.xfrc_applied
             for part, value in zip(parts, held, strict=True):
                 part.copy_(value)
+        if self.pd.interpolate:
+            torch.lerp(self.before_targets, held[0], (k + 1) / of, out=drive.ctrl)
+            if k + 1 == of:
+                self.before_targets.copy_(held[0])
         for event in self.events:
             event.before_substep(drive)
+
+    def begin(self, fresh: Tensor) -> None:
+        """Worlds `fresh (N,)` bool have no targets before those that are in the drive."""
+        if self.pd.interpolate:
+            torch.where(
+                fresh[:, None], self.backend.drive.ctrl, self.before_targets, out=self.before_targets
+            )
 
     def with_help(
         self, action: Tensor, targets: Tensor, rows: Tensor, *state: Tensor
@@ -200,6 +213,11 @@ class Controls:
             targets, rows = self._recovery.targets(targets[rows]), self._every
         left = budget.at(budget.group(goal))
         self.wrench = self.actuation.apply(self.action, targets, rows, left, budget.now > 0)
+        self.actuation.begin(age == 0)
+
+    def rows(self) -> dict[str, Tensor]:
+        """What copies of worlds need `(N, ...)` beside the action."""
+        return {"targets": self.actuation.before_targets} if self._task.pd.interpolate else {}
 
     def sources(self) -> dict[str, Tensor]:
         """What terms may read of the begin of the last step, by name."""
@@ -226,11 +244,12 @@ def steps(drivers: Sequence[Actuation], step: Callable[[int], None], substeps: i
 
     step: makes so many physics steps with what is in the drives.
     """
-    if not any([driver.before() for driver in drivers]):
+    varies = any([driver.before() for driver in drivers])
+    if not varies and not any(driver.pd.interpolate for driver in drivers):
         step(substeps)
         return
     held = [driver.held() for driver in drivers]
     for k in range(substeps):
         for driver, values in zip(drivers, held, strict=True):
-            driver.substep(values if k else None)
+            driver.substep(values, k, substeps)
         step(1)

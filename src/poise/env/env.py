@@ -118,6 +118,7 @@ def state_of(env: ImitationEnv) -> dict[str, Tensor]:
         "qvel": env.backend.state.qvel.clone(),
         "age": env.age.clone(),
         "action": env.action.clone(),
+        **{k: v.clone() for k, v in env.controls.rows().items()},
         **env.goal.state(),
         **{k: v for event in env.events for k, v in event.state().items()},
     }
@@ -132,8 +133,9 @@ def put_state(env: ImitationEnv, state: Mapping[str, Tensor]) -> None:
         env.backend.restore(state["sim"])
     else:
         env.backend.write(None, state["qpos"], state["qvel"])
-    for name in ("age", "action"):
-        getattr(env, name).copy_(state[name])
+    own = {"age": env.age, "action": env.action, **env.controls.rows()}
+    for name, value in own.items():
+        value.copy_(state[name])
     for event in env.events:
         event.load_state(state)
     if env.goal.begins:
@@ -143,7 +145,7 @@ def put_state(env: ImitationEnv, state: Mapping[str, Tensor]) -> None:
 def _rows(env: ImitationEnv) -> dict[str, Tensor]:
     """The tensors `(N, ...)` of an environment beside its physics, by name."""
     goal = {f"goal/{k}": v for k, v in env.goal.rows().items()}
-    own = {"age": env.age, "action": env.action, **goal}
+    own = {"age": env.age, "action": env.action, **env.controls.rows(), **goal}
     return {**own, **{k: v for event in env.events for k, v in event.rows().items()}}
 
 

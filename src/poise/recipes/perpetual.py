@@ -321,9 +321,9 @@ def _failure(config: Perpetual, humanoid: Humanoid) -> DoneTerm:
 
 def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:
     if config.action == "additive":
-        return PDTargets("additive")
+        return PDTargets("additive", interpolate=config.interpolate)
     ranges = torch.tensor(humanoid.model.jnt_range[1:]).float()
-    return PDTargets("absolute", range_scale(ranges))
+    return PDTargets("absolute", range_scale(ranges), interpolate=config.interpolate)
 
 
 def build(

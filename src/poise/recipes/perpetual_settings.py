@@ -118,6 +118,8 @@ class Perpetual:
         window: control steps ahead of which the observation tells the reference's place, heading and
             `KEY_PARTS` besides the next one's whole pose, such as (2, 4, 8); a stream's last known frame
             is repeated.
+        interpolate: targets of joints go evenly from the last to the new ones within a control step, see
+            `control.PDTargets`.
         filter: share of the last action that actions keep, see `TaskConfig.filter`; the policy then
             observes the last action. 0 for none.
         action: "absolute" as in the paper, or "additive" to the reference's angles.
@@ -171,6 +173,7 @@ class Perpetual:
     heading: Literal["hips", "twist"] = "hips"
     window: Annotated[tuple[int, ...], Range(2, unit="control steps")] = ()
     filter: Annotated[float, Range(0, 1, below=True)] = 0.0
+    interpolate: bool = False
     action: Literal["absolute", "additive"] = "absolute"
     faithful: Literal["paper", "code"] = "code"
     energy: float = 0.00005
