@@ -309,7 +309,7 @@ class GeneratorGoal(BufferedGoal):
             return self.generator.generate(past, ids, self.rng)
         out = list[Tensor]()
         for row, world in enumerate(ids.tolist()):
-            best = self._preferred(world, past[row : row + 1], 1)
+            best = self._preferred(world, past[row : row + 1], 1, True)
             if best.along is not None:
                 self._known_along[world] = best.along[0, self.keeps - 1]
             out.append(best.made[0])
@@ -319,12 +319,12 @@ class GeneratorGoal(BufferedGoal):
     def _proposes(self) -> bool:
         return getattr(self.generator, "propose", None) is not None
 
-    def _preferred(self, world: int, past: Tensor, count: int) -> Futures:
+    def _preferred(self, world: int, past: Tensor, count: int, wished: bool) -> Futures:
         """The best of what may follow `past (1, past, 7 + n)`, at most so many."""
         propose = self.generator.propose  # type: ignore[attr-defined]
         ids = torch.tensor([world], device=self.device)
         if not self.steering.chooses:
-            return Futures(propose(past, self.rng, count, ids)[0])
+            return Futures(propose(past, self.rng, count, ids if wished else None)[0])
         last, target = past[0, -1].double(), self._target(world)
         path, begun = self._path(world, last)
         goes = target is not None or path is not None
@@ -332,7 +332,7 @@ class GeneratorGoal(BufferedGoal):
         crowded = any(float((o - last[:2]).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
         many = PROPOSALS if target is not None else SOME if goes or crowded else FEW
         # A place to go counts alone, not what the world wishes.
-        made = propose(past, self.rng, many, None if goes else ids)[0]
+        made = propose(past, self.rng, many, ids if wished and not goes else None)[0]
         cost = torch.zeros(len(made)).to(made)
         along = None
         if path is not None:
@@ -355,21 +355,19 @@ class GeneratorGoal(BufferedGoal):
         self.count[world] = self.at[world] + 1
         self._known_along[world] = self._along[world]
 
-    def futures(self, world: int, count: int, turns: bool = False) -> Futures:
+    def futures(self, world: int, count: int, wished: bool = True) -> Futures:
         """Motions that may follow in a world, at most so many; a generator that proposes none has one.
 
-        turns: whether the world turns to another label first, where the generator has any.
+        wished: as the world wishes, or whatever the generator makes.
         """
         p = self.generator.past
         index = self.count[world] - p + torch.arange(p, device=self.device)
         past = self.qpos[world, index.clamp_min(0) % self.size][None]
         ids = torch.tensor([world], device=self.device)
         past = self._past(past, ids) if self.simulated else past
-        if turns and (turn := getattr(self.generator, "turn", None)) is not None:
-            turn(ids)
         if not self._proposes:
             return Futures(self.generator.generate(past, ids, self.rng))
-        return self._preferred(world, past, count)
+        return self._preferred(world, past, count, wished)
 
     def choose(self, world: int, futures: Futures, which: int, frames: int) -> None:
         """So many frames of one of some futures follow in a world; frames that are not finite are left

@@ -116,9 +116,9 @@ class Rehearsal:
     A kinematic policy knows nothing of balance. Whenever more frames of a character's motion are needed,
     copies of the character as it stands each follow one of several futures by the policy alone, and the
     first in the generator's own order is taken whose copy stays within `NEAR_M` and ends within `END_M`:
-    motions that can be done are as likely as they were. If no copy does, more are drawn, of another
-    label than the world kept to; in the end the one that is followed for longest is taken, up to shortly
-    before it is lost.
+    motions that can be done are as likely as they were. If no copy does, more are drawn, whatever label
+    the world keeps to; in the end the one that is followed for longest is taken, up to shortly before it
+    is lost.
 
     Args:
         acts: the controller.
@@ -170,8 +170,8 @@ class Rehearsal:
         drawn: list[Futures] = []
 
         def futures(k: int) -> Tensor:
-            # What cannot be done is not kept to.
-            drawn.append(goal.futures(world, len(trials), turns=k > 0))
+            # The label that the world keeps to counts once.
+            drawn.append(goal.futures(world, len(trials), wished=k == 0))
             return drawn[k].made[:, : goal.keeps]
 
         def begin() -> None:

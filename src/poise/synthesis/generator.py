@@ -272,11 +272,6 @@ class Kinematic:
         own = self.net, self.seeds, self.fps, self.temperature, self.bounds, self.codes
         return Kinematic(*own, wishes, self.latent)
 
-    def turn(self, ids: Tensor) -> None:
-        """Worlds `ids (n,)` keep to their label no longer."""
-        if self.wishes is not None:
-            self.wishes.left[ids] = 0
-
     def begin(self, count: int, rng: torch.Generator) -> Tensor:
         """`(count, past, 7 + n)` of the seeds, drawn evenly, set to the origin."""
         frames = self.seeds[torch.randint(len(self.seeds), (count,), generator=rng)].clone()
