@@ -1,6 +1,6 @@
 """Draws docs/dream-replay.svg: a character that goes about, as a picture that moves.
 
-    poise dream --seconds 30 --seed 3 -o dreamt
+    poise dream --seconds 60 --seed 1 -o dreamt
     python docs/make_dream_replay.py dreamt/simulated.bvh docs/dream-replay.svg
 
 The camera goes along with the character and looks in one direction; dashes on the floor stand still,

@@ -1,6 +1,6 @@
 """Draws docs/dream.svg: a character that goes about, seen every second, one row for ten seconds.
 
-    poise dream --seconds 30 --seed 3 -o dreamt
+    poise dream --seconds 60 --seed 1 -o dreamt
     python docs/make_dream_svg.py dreamt/simulated.bvh docs/dream.svg
 
 Each figure is seen from the same side, moved to its place in the strip; the line is the floor.
