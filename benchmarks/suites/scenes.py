@@ -3,6 +3,8 @@ fights.
 
 All by the policy that ships, alone and without help. Each scene stands beside its twin that does not
 give way ("without", the law off), and fights beside the player whom nobody touches: these are the nulls.
+The part "learned" measures the same with what runs of `poise train compliant SCENE` learned on top,
+which lie in `--work`, compliant/NAME; the rows of the other parts are those of the plain policy.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import torch
 from scipy.stats import spearmanr
 
 from benchmarks.common.clips import WALK, Places, moment
+from benchmarks.common.policies import stated
 from benchmarks.common.rows import Figure, of, short
 from benchmarks.common.runner import Part, Raws
 from poise.control import Compliance, Stiffness
@@ -27,11 +30,19 @@ from poise.env.pushes import Pushes
 from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
+from poise.learn import LATEST, PPOConfig, Until
 from poise.motion import Clip
 from poise.papers.compliant.figures import measure, slope, throws
 from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.scene_play import COUNTS, Played, play
-from poise.papers.compliant.scene_training import shipped
+from poise.papers.compliant.scene_training import (
+    Compliant,
+    LearnedOnTop,
+    digest_of,
+    open_learned,
+    shipped,
+    train,
+)
 from poise.papers.compliant.scenes import (
     Balance,
     Chicken,
@@ -100,6 +111,7 @@ LAG = "stiffness 500, lag 0.5 s"
 #: What gives way, by its name.
 WAY: dict[str, Given] = {
     "without": None,
+    "level 0": Compliance(0.0),
     "level 0.04": Compliance(0.04),
     "level 0.16": Compliance(0.16),
     "level 0.2": Compliance(0.2),
@@ -178,15 +190,15 @@ def throw_units(places: Places) -> list[str]:
     return list(THROWS)[: 1 if places.smoke else None]
 
 
-def thrown(places: Places, unit: str) -> Any:
-    """The same throws at each level; the first is the null."""
+def thrown(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
+    """The same throws at each level; the first is the null. top: on top of the policy."""
     law, _, rate = unit.removesuffix(" Hz").partition(", ")
     given: Any = Stiffness() if law == "stiffness" else Compliance(law=law)  # type: ignore[arg-type]
     levels = SOFT if law == "stiffness" else LEVELS
     count = THROWS[unit]
     if places.smoke:
         count, levels = 2, levels[::5]
-    found = throws(policy(), given, levels, count, float(rate), threads=1)
+    found = throws(policy(), given, levels, count, float(rate), threads=1, learned=top)
     out: dict[str, Any] = {"levels": list(levels), "fell": found.fell.sum(1).tolist(), "throws": count}
     out["goal_moved_mm"] = (1000 * np.nanmean(found.moved, 1)).tolist()
     for name in ("impulse", "peak", "torque"):
@@ -278,9 +290,11 @@ def scene_units(places: Places, begins: str) -> list[str]:
     return [n for n in SCENES if n.startswith(begins)][: 1 if places.smoke else None]
 
 
-def played(places: Places, unit: str) -> Any:
-    """A scene by each way beside its twin."""
+def played(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
+    """A scene by each way beside its twin. top: on top of the policy, by the levels that it learned."""
     scene, ways, seconds, many = SCENES[unit]
+    if top is not None:
+        ways = TOP_LEVELS if top.config.drawn else ("as learned",)
     if places.smoke:
         ways, seconds, many = ways[:1], 1.0, 1
     tracker = policy()
@@ -289,11 +303,11 @@ def played(places: Places, unit: str) -> Any:
         clip = moment() if places.smoke else read_clip(places.data / RUN)
     out: dict[str, Any] = {"episodes": many}
     for way in ways:
-        own = shipped("ball", tracker) if way == "learned" else None
+        own = shipped("ball", tracker) if way == "learned" else top
         how = {} if not seconds else {"seconds": seconds}
         made = play(scene, tracker, clip, WAY.get(way), many, threads=1, learned=own, **how)
         out["without"], out[way] = told(made.stiff_episodes), told(made.episodes)
-    if not isinstance(scene, Balance):
+    if top is None and not isinstance(scene, Balance):
         out["nobody touches"] = nobody(tracker, scene, clip, made, many, seconds)
     return out
 
@@ -320,6 +334,64 @@ def scene_rows(places: Places, raws: Raws) -> Iterator[Figure]:
             peaks = figures.get("force_peak_n")
             if peaks and not fictional:
                 yield Figure(f"{unit}, {way}", "force_most_n", max(peaks), len(peaks))
+
+
+#: Levels at which what has learned several is measured in scenes; the words before a run's name.
+TOP_LEVELS, BY = ("level 0", "level 0.04", "level 0.16", "level 0.2"), ", learned by "
+
+
+@cache
+def tops(places: Places) -> dict[str, LearnedOnTop]:
+    """What runs have learned on top of the policy, by the names of their folders."""
+    home = places.work / "compliant"
+    if places.smoke and not home.exists():
+        net = PPOConfig(horizon=2, epochs=1, minibatch=4, policy_hidden=(8,), value_hidden=(8,))
+        tiny = Compliant("throws", seconds=0.5, num_envs=2, ppo=net)
+        train(tiny, policy(), home / "smoke", Until(iterations=1), threads=1, tensorboard=False)
+    found = (file.parent for file in sorted(home.glob(f"*/{LATEST}")))
+    return {folder.name: open_learned(folder, policy()) for folder in found}
+
+
+def fits(top: LearnedOnTop, unit: str) -> bool:
+    """Whether a case of the suite is of the scene that was learned, with the same players."""
+    scene, own = SCENES[unit][0], top.config.play()
+    if isinstance(scene, Chicken) and isinstance(own, Chicken):
+        return (scene.mass, scene.other) == (own.mass, own.other)
+    return type(scene) is type(own)
+
+
+def top_units(places: Places) -> list[str]:
+    """Cases of each run's scene; throws at the rate of the paper."""
+    out = list[str]()
+    for name, top in tops(places).items():
+        cases = [unit for unit in SCENES if fits(top, unit)]
+        if top.config.scene == "throws" and top.config.drawn:
+            cases.append("throws, eq8, 600 Hz")
+        out += [case + BY + name for case in cases]
+    return out
+
+
+def on_top(places: Places, unit: str) -> Any:
+    """A case with what a run has learned."""
+    case, _, name = unit.partition(BY)
+    top = tops(places)[name]
+    if case.startswith("throws"):
+        raw = thrown(places, case.removeprefix("throws, "), top)
+    else:
+        raw = played(places, case, top)
+    return raw | {"policy": f"{name} {digest_of(top.top)} (learned on top)"}
+
+
+def top_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Rows as those of the plain policy, which stand in the other parts; these state the run."""
+    for unit, raw in raws.items():
+        own = {k: v for k, v in raw.items() if k not in ("policy", "without")}
+        if unit.startswith("throws"):
+            rows = throw_rows(places, {unit.removeprefix("throws, "): own})
+        else:
+            rows = scene_rows(places, {unit: own})
+        for row in rows:
+            yield row._replace(policy=f"{stated(_SHIPS)}; {raw['policy']}")
 
 
 def interval(values: list[float], name: str) -> str:
@@ -409,6 +481,9 @@ PARTS = {
             ("chicken", "chicken", _SHIPS, 0.5),
         )
     },
+    "learned": Part(
+        "scenes with what was learned on top", top_units, on_top, top_rows, _SHIPS, hours=3.0, needs=()
+    ),
     "cost": Part(
         "what compliance costs", lambda _: ["cost"], costs, cost_rows, alone=True, hours=0.05, needs=()
     ),

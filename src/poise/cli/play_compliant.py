@@ -99,8 +99,8 @@ def run(
         length: ball: of the rod (1).
         pushes: ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0).
         seed: throws, ball, chicken: of the draws (0).
-        learned: what was learned on top of the policy: the folder of poise train compliant SCENE. For
-            the ball something comes along; none goes without.
+        learned: what was learned on top of the policy: the folder of poise train compliant SCENE, at
+            --level where it learned levels. For the ball something comes along; none goes without.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the
             scene.
         budget: simulated control steps of lookahead for each that is made, by default 192.
@@ -144,8 +144,9 @@ def run(
         tracker = open_run(policy).tracker
         chosen = level is not None or newtons_per_metre is not None
         if learned is None:
-            alone = chosen or controller == "lookahead"
-            knows = None if alone else shipped(scene, tracker)
+            knows = None if controller == "lookahead" else shipped(scene, tracker)
+            # What comes along and has learned no levels is not asked for one.
+            knows = None if chosen and knows is not None and knows.config.drawn is None else knows
         else:
             knows = None if str(learned) == "none" else open_learned(learned, tracker)
     if knows is not None and knows.config.scene != scene:
@@ -153,12 +154,8 @@ def run(
         raise PoiseError(
             what, learned, f"Write poise play compliant {knows.config.scene}", code="scene-differs"
         )
-    if knows is not None and chosen:
-        raise PoiseError(
-            "a run gives way as it has learned to",
-            hint="Leave --level, --stiffness out",
-            code="option-not-applicable",
-        )
+    if knows is not None:
+        given = knows.config.played(given)
     with claimed(out):
         with working("simulating"):
             more = (count, duration, threads, scene, knows, controller, how)

@@ -44,7 +44,7 @@ class Options:
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
-    """Motion files. compliant: the scene, ball or door."""
+    """Motion files. compliant: the scene: ball, door, throws, hands, trampoline, chicken."""
     json: Json = False
     training: OmitArgPrefixes[Training] = Training()
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)

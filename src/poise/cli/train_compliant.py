@@ -31,7 +31,7 @@ def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
         )
     refuse_held(out, RUN_FILE, training)
     with working("opening the policy"):
-        tracker = open_run(None).tracker
+        tracker = open_run(config.policy or None).tracker
     until = Until(minutes=training.minutes, iterations=training.iterations)
     with claimed(out), progress(until) as show:
         result = train(config, tracker, out, until, show, training.threads)

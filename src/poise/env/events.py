@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Generic, NamedTuple, Self, TypeVarTuple
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -237,12 +238,45 @@ class AdaptiveSampling(Event):
         self._counts.copy_(own[1:])
 
 
+class WorldModels:
+    """Models of one structure, of which each world of a backend has one: what differs between them
+    becomes a field of each world, so that the worlds are stepped together.
+
+    Attributes:
+        which: `(N,)`, the model that each world has, at first the first one.
+
+    Args:
+        backend: its own model is the first one.
+        models: S of them.
+        but: fields that stay as they are in each world.
+    """
+
+    def __init__(self, backend: Backend, models: Sequence[mujoco.MjModel], but: Sequence[str] = ()):
+        fields = {k: v for k, v in differing(models).items() if k not in but}
+        self._live = {name: backend.expand(name) for name in fields}
+        self._values = {
+            name: torch.from_numpy(fields[name]).to(live).view(len(models), *live.shape[1:])
+            for name, live in self._live.items()
+        }
+        self.which = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
+
+    def assign(self, rows: Tensor | None, which: Tensor) -> None:
+        """Worlds `rows (n,)`, all for None, take the models `which (n,)`, before they are set down."""
+        old = self.which if rows is None else self.which[rows]
+        changed = (which != old).nonzero().squeeze(-1)
+        if not len(changed):
+            return
+        ids, new = changed if rows is None else rows[changed], which[changed]
+        self.which[ids] = new
+        for name, live in self._live.items():
+            live[ids] = self._values[name].index_select(0, new)
+
+
 class BodyAssignment(Event):
     """The bodies of a backend's worlds: a world takes the body that its clip is for.
 
-    All bodies have the same joints, hinges and shapes; lengths, sizes, masses and strengths differ. What
-    differs between their compiled models becomes a field of each world, so that the worlds are stepped
-    together, and a new episode only copies the numbers of its body.
+    All bodies have the same joints, hinges and shapes; lengths, sizes, masses and strengths differ, see
+    `WorldModels`. A new episode only copies the numbers of its body.
 
     Attributes:
         body: `(N,)`, which body each world has.
@@ -254,14 +288,9 @@ class BodyAssignment(Event):
     """
 
     def __init__(self, backend: Backend, humanoids: Sequence[Humanoid]):
-        fields = differing([backend.model, *(alone(h) for h in humanoids[1:])])
-        self._live = {name: backend.expand(name) for name in fields}
-        self._values = {
-            name: torch.from_numpy(fields[name]).to(live).view(len(humanoids), *live.shape[1:])
-            for name, live in self._live.items()
-        }
+        self._models = WorldModels(backend, [backend.model, *(alone(h) for h in humanoids[1:])])
         self.sizes = torch.stack([shape_of(h) for h in humanoids]).to(backend.device)
-        self.body = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
+        self.body = self._models.which
 
     def tells(self) -> Mapping[str, Tensor | Observable]:
         """The sizes of each character's body."""
@@ -273,11 +302,4 @@ class BodyAssignment(Event):
 
     def assign(self, rows: Tensor | None, body: Tensor) -> None:
         """Worlds `rows (n,)`, all for None, take the bodies `body (n,)`, before they are set down."""
-        old = self.body if rows is None else self.body[rows]
-        changed = (body != old).nonzero().squeeze(-1)
-        if not len(changed):
-            return
-        ids, new = changed if rows is None else rows[changed], body[changed]
-        self.body[ids] = new
-        for name, live in self._live.items():
-            live[ids] = self._values[name].index_select(0, new)
+        self._models.assign(rows, body)

@@ -11,11 +11,20 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from poise.env.events import EpisodeStart, Event, Felt, Force, StatedEvent, StepOutcome
+from poise.env.events import (
+    EpisodeStart,
+    Event,
+    Felt,
+    Force,
+    StatedEvent,
+    StepOutcome,
+    WorldModels,
+)
 from poise.env.goal import Goal
 from poise.errors import PoiseError, did_you_mean
 from poise.settings import Checked, Positive, Range
-from poise.sim import Backend, CharacterRows, Drive, SceneSim, Touch
+from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim, Touch
+from poise.sim.props import Prop
 
 #: Worlds `(N,)` bool in which something is so, such as a hand near a knob.
 Condition = Callable[[SceneSim], Tensor]
@@ -26,6 +35,10 @@ class SceneEvent(StatedEvent[SceneSim, float], Event):
 
     Episodes of all characters begin in worlds, see `EpisodeStart.worlds`.
     """
+
+    def tells(self) -> Mapping[str, Tensor]:
+        """Tensors of all worlds by name, for terms of one character in each."""
+        return {}
 
 
 class RandomEvent(SceneEvent):
@@ -127,6 +140,10 @@ def touches_of(name: str, thing: str, bodies: tuple[str, ...], prefix: str = "")
     return tuple(Touch(f"{name}:{body}", thing, prefix + body) for body in bodies)
 
 
+#: N; weaker forces are none.
+LEAST_N = 1.0
+#: s since a force was felt, at first.
+LONG_S = 1e3
 #: The name by which a character sees the others that share its rows.
 OTHERS = "others"
 _OF_OTHERS = ("qpos", "qvel", "xpos", "xquat")
@@ -175,6 +192,10 @@ class InScene:
 class ScenePart(Force):
     """A task's part in the N worlds of a scene, for its K characters in each.
 
+    Where forces are felt, terms can read "load" `(N K,)`, N: the mean size of what is metered over the
+    last control step, or else of what is felt at its end; and "since" `(N K,)`, s since that was
+    `LEAST_N` or more in this episode.
+
     Attributes:
         events: its own ones, in order.
         sim: the worlds.
@@ -188,9 +209,13 @@ class ScenePart(Force):
         self.events = [make(sim, control_hz) for make in given.events]
         self._sources: dict[str, Tensor] = {}
         self._fresh, self._step_s = True, float(sim.scene.model.opt.timestep)
+        self._control_s = 1.0 / control_hz
         for name in (*given.touches, *given.metered):
             sim.touch(name)
         self._feels = [end for name in given.felt for end in ends_on(sim, rows, name)]
+        if self._feels:
+            load = torch.zeros(rows.num_envs, device=rows.device)
+            self._sources |= {"load": load, "since": torch.full_like(load, LONG_S)}
         self.look(None)
         for name in given.metered:
             force = sim.touch(name).force
@@ -198,11 +223,16 @@ class ScenePart(Force):
             self._share(f"peak/{name}", torch.zeros_like(force[:, 0]))
 
     def tells(self) -> Mapping[str, Tensor]:
-        return self._sources
+        told = dict(self._sources)
+        for event in self.events:
+            told |= event.tells()
+        return told
 
     def begin(self, episodes: EpisodeStart) -> None:
         """Events begin anew in worlds where all characters do; characters see the others of theirs."""
         k, ids = self._many, episodes.ids
+        if self._feels:
+            self._sources["since"][episodes.rows] = LONG_S
         if self.events:
             n = self.sim.num_envs
             every = torch.arange(n, device=self.sim.backend.device)
@@ -250,6 +280,7 @@ class ScenePart(Force):
         for event in self.events:
             event.after_step()
         self.look(None)
+        self._weigh()
 
     def judged(self, outcome: StepOutcome) -> None:
         """Cuts off the episodes of the others."""
@@ -262,6 +293,8 @@ class ScenePart(Force):
             return {}
         named = enumerate(self.events)
         out = {f"event/{i}/{k}": v for i, h in named for k, v in h.rows().items()}
+        if self._feels:
+            out["since"] = self._sources["since"]
         return out if self.sim.link_data is None else {**out, "links": self.sim.link_data}
 
     def state(self) -> dict[str, Tensor]:
@@ -281,6 +314,8 @@ class ScenePart(Force):
 
     def look(self, ids: Tensor | None) -> None:
         """Brings what it tells up to date."""
+        for event in self.events:
+            event.look(ids)
         for name in self.given.sees:
             if name == OTHERS:
                 for field in _OF_OTHERS:
@@ -307,6 +342,21 @@ class ScenePart(Force):
             self._sources[name].copy_(value)
         else:
             self._sources[name] = value.float().clone()
+
+    def _weigh(self) -> None:
+        """Takes down how large the forces of the control step were."""
+        felt = None if self.given.metered else self.felt()
+        if not self._feels:
+            return
+        if felt is None:
+            sums = [self._sources[f"impulse/{name}"].norm(dim=-1) for name in self.given.metered]
+            load = torch.stack(sums).sum(0) / self._control_s
+        else:
+            load = felt.force.norm(dim=-1).sum(1)
+        self._keep("load", load)
+        since = self._sources["since"]
+        since += self._control_s
+        since[load >= LEAST_N] = 0.0
 
     def _note(self) -> None:
         """Adds what a physics step measured to what is metered."""
@@ -375,6 +425,63 @@ class SetDown(RandomEvent):
             qpos[:, : self._moved] += self.between(-spread, spread, n, self._moved)
         here = self._sim.backend.device
         self._sim.place(self.name, qpos.to(here), self._qvel.repeat(n, 1).to(here), worlds)
+
+
+@dataclass
+class Varied(RandomEvent):
+    """Things and links of which each world has one of several makes, drawn when its episode begins: a
+    door of another width, a rod of another length. A replica of the scene is compiled for each.
+
+    At work it has `choice` `(N,)`, the make of each world.
+
+    Attributes:
+        makes: things and links of each make, in place of those of their names; the first is that of the
+            scene.
+        numbers: of each make `(K, ...)`, which terms read as `(N, ...)` by these names.
+        seed: of the draws.
+    """
+
+    makes: tuple[tuple[Prop | Link, ...], ...]
+    numbers: Mapping[str, Tensor]
+    seed: int = 0
+
+    def enter(self, sim: SceneSim, control_hz: float) -> None:
+        super().enter(sim, control_hz)
+        whole, models = sim.scene.scene, [sim.scene.model]
+        for make in self.makes[1:]:
+            links = {x.name: x for x in make if isinstance(x, Link)}
+            things = {x.name: x for x in make if not isinstance(x, Link)}
+            other = replace(
+                whole,
+                things=tuple(things.get(x.name, x) for x in whole.things),
+                links=tuple(links.get(x.name, x) for x in whole.links),
+            )
+            models.append(other.compile().model)
+        # Links are set as they are switched on.
+        self._models = WorldModels(sim.backend, models, ("eq_data",))
+        self.choice = torch.zeros_like(self._models.which)
+        self._told = {
+            k: v.to(sim.backend.device).index_select(0, self.choice) for k, v in self.numbers.items()
+        }
+
+    def tells(self) -> Mapping[str, Tensor]:
+        return self._told
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"choice": self.choice}
+
+    def begin(self, episodes: EpisodeStart) -> None:
+        worlds = episodes.worlds
+        drawn = torch.randint(len(self.makes), (len(worlds),), generator=self.rng)
+        self.choice[worlds] = drawn.to(self.choice.device)
+        self.look(None)
+
+    def look(self, ids: Tensor | None) -> None:
+        if bool((self.choice == self._models.which).all()):
+            return
+        self._models.assign(None, self.choice)
+        for name, value in self._told.items():
+            value.copy_(self.numbers[name].to(value)[self.choice])
 
 
 @dataclass

@@ -56,6 +56,10 @@ class Spread:
             f"{self.turning_rad_s:g} rad/s{heading}"
         )
 
+    def times(self, factor: float) -> Spread:
+        """All of them so many times as large."""
+        return Spread(*(factor * getattr(self, f.name) for f in fields(self)))
+
     def move(self, qpos: Tensor, qvel: Tensor, rng: np.random.Generator) -> None:
         """Moves a state `(7 + n,)` and `(6 + n,)` in place, by one draw of each deviation."""
         turn = torch.as_tensor(rng.normal(scale=self.joints_rad, size=len(qvel) - 3)).to(qpos)

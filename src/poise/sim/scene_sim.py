@@ -369,11 +369,11 @@ class SceneSim:
         state.qvel[to, place.dofs] = qvel.to(state.qvel)
         self.backend.forward(rows)
 
-    def switch(self, name: str, on: bool, rows: Tensor | None = None) -> None:
+    def switch(self, name: str, on: bool, rows: Tensor | None = None, at: Tensor | None = None) -> None:
         """Switches a link on or off in worlds `rows (n,)`, all for None.
 
         Switched on, a weld keeps its bodies as they are just now; a ball joint pulls `Link.at` to
-        `Link.to`, or holds it where it is.
+        `Link.to`, or holds it where it is. at: `(n, 3)` in place of `Link.at`, where worlds differ.
 
         Raises:
             PoiseError: bodies that are farther apart than `FAR_M`.
@@ -394,8 +394,8 @@ class SceneSim:
             pos_a, pos_b, quat_a, quat_b = (
                 field[to, body].double() for field in (state.xpos, state.xquat) for body in (a, b)
             )
-            at = torch.tensor(link.at).to(pos_a)
-            held = pos_b + quat_rotate(quat_b, at.expand_as(pos_b))
+            point = (torch.tensor(link.at) if at is None else at).to(pos_a)
+            held = pos_b + quat_rotate(quat_b, point.expand_as(pos_b))
             back = quat_conj(quat_a)
             seen = quat_rotate(back, held - pos_a)
             wanted = seen if link.to is None else torch.tensor(link.to).to(seen).expand_as(seen)
@@ -409,11 +409,11 @@ class SceneSim:
             data = self.link_data[to, i].double()
             if link.kind == "weld":
                 # Anchor on b; then the anchor's place and b's turn as seen from a.
-                data[:, :3] = at
+                data[:, :3] = point
                 data[:, 3:6] = seen
                 data[:, 6:10] = quat_mul(back, quat_b)
             else:
-                data[:, :3], data[:, 3:6] = wanted, at
+                data[:, :3], data[:, 3:6] = wanted, point
             self.link_data[to, i] = data.to(self.link_data)
         state["eq_active"][to, i] = on
 
@@ -480,7 +480,7 @@ class SceneSim:
 
     def _data(self, env: int) -> mujoco.MjData:
         data = self.backend.get_data(env)
-        mujoco.mj_forward(self.scene.model, data)
+        mujoco.mj_forward(self.backend.get_model(env), data)
         return data
 
     def _solid(self, body: int) -> int:
@@ -507,9 +507,9 @@ class SceneSim:
             for body in (a, b)
         ]
         for env in rows.tolist():
-            data = self._data(env)
+            data, own = self._data(env), self.backend.get_model(env)
             gaps = (
-                mujoco.mj_geomDistance(model, data, g, h, 1e3, None) for g in geoms[0] for h in geoms[1]
+                mujoco.mj_geomDistance(own, data, g, h, 1e3, None) for g in geoms[0] for h in geoms[1]
             )
             far = min(gaps, default=0.0)
             if far > FAR_M:

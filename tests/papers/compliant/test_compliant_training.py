@@ -11,15 +11,19 @@ import pytest
 import torch
 
 from poise.cli.main import main
+from poise.control import Compliance, Stiffness
+from poise.env.yielding import Yielding
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
+from poise.papers.compliant.figures import throws
 from poise.papers.compliant.scene_play import play
 from poise.papers.compliant.scene_training import (
     Added,
     Compliant,
     OnTop,
+    config_of,
     open_learned,
     save_learned,
     scene_task,
@@ -27,6 +31,7 @@ from poise.papers.compliant.scene_training import (
     train,
 )
 from poise.papers.compliant.scenes.ball import FictionalForces
+from poise.settings import to_data
 from refusals import refused
 
 PPO = PPOConfig(
@@ -106,6 +111,90 @@ def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
     assert shipped("ball", other) is None
 
 
+@pytest.mark.parametrize("scene", ["throws", "hands", "trampoline", "chicken"])
+def test_scenes_without_a_task_learn_to_give_way(tracker: Tracker, scene: str) -> None:
+    config = replace(TINY, scene=scene, num_envs=6, seconds=0.5)
+    assert config.added(0) == Added(0, 0.3, False) and config.drawn == (0.0, 0.2)
+    env = scene_task(config, tracker).env(6, threads=1, help_scale=0.0, guard=False)
+    top = OnTop(env, tracker.policy, config.added(tracker.policy.num_obs))
+    obs, yields = top.reset(), env.event(Yielding)
+    assert yields is not None
+    # Levels are drawn for each episode, and seen; episodes begin off the motion.
+    level, seen = yields.level.clone(), env.columns["level"]
+    assert 0.0 <= float(level.min()) < float(level.max()) <= 0.2
+    torch.testing.assert_close(obs[:, seen.start - top.added.seen], (5.0 * level).float())
+    off = env.backend.state.qpos[:, 7:] - env.goal.start()[0][:, 7:]
+    assert 0.01 < float(off.std()) < 0.04
+    step = top.step(torch.zeros(6, top.num_actions))
+    paid = env.terms["task/eased"]
+    assert bool(((paid > 0.0) & (paid <= 1.0)).all()) and bool(step.reward.isfinite().all())
+    if scene == "hands":
+        assert float(paid.max()) < 0.9
+    top.close()
+
+
+def test_what_learned_levels_is_played_at_each(tracker: Tracker, tmp_path: Path) -> None:
+    config = replace(TINY, scene="throws", num_envs=2, level=(0.0, 0.1))
+    train(config, tracker, tmp_path / "run", Until(iterations=1), threads=1, tensorboard=False)
+    learned = open_learned(tmp_path / "run", tracker)
+    assert learned.config == config
+    played = play(config.play(), tracker, None, Compliance(0.05), 1, 0.5, 1, "throws", learned)
+    given = played.imitation.task.compliance
+    assert isinstance(given, Compliance) and given.level == 0.05 and given.drawn is None
+    # What was learned acts, at the level that is asked for.
+    found = throws(tracker, Compliance(), (0.0, 0.1), 2, threads=1, learned=learned)
+    plain = throws(tracker, Compliance(), (0.0,), 2, threads=1)
+    assert found.torque.shape == (2, 2) and (found.torque[:1] != plain.torque).any()
+    assert not found.moved[0].any() and (found.moved[1] > 0.0).all()
+    assert learned.config.played(None) == Compliance()
+    with refused("option-not-applicable", says="no stiffness"):
+        learned.config.played(Stiffness(200.0))
+    one = replace(config, level=0.1)
+    assert one.drawn is None and one.played(None) == Compliance(0.1)
+    with refused("option-not-applicable", says="as it has learned"):
+        one.played(Compliance(0.16))
+    with refused("settings-conflict", says="a motion of its own"):
+        replace(config, scene="door", clip="walk.bvh")
+
+
+def test_rods_and_doors_are_drawn_for_each_episode(tracker: Tracker) -> None:
+    config = replace(TINY, num_envs=8)
+    env = scene_task(config, tracker).env(8, threads=1, help_scale=0.0, guard=False)
+    env.reset()
+    model = env.backend.get_model
+    balls = [model(k).geom("rod/ball").pos[2] for k in range(8)]
+    weights = [model(k).body("rod").mass[0] for k in range(8)]
+    assert 0.8 <= min(balls) < max(balls) <= 1.2 and len(set(weights)) > 2
+    # Of a rod that stands upright, all see the same height.
+    height = env.observe()[:, env.columns["task/ball"]][:, 2]
+    assert float(height.std()) < 0.02
+    env.close()
+    config = replace(config, scene="door", width=(1.0, 1.7), seconds=3.0)
+    env = scene_task(config, tracker).env(8, threads=1, help_scale=0.0, guard=False)
+    env.reset()
+    knobs = [env.backend.get_model(k).site("link grip").pos[1] for k in range(8)]
+    assert 0.9 < min(knobs) < max(knobs) < 1.7
+    for _ in range(55):
+        env.step(tracker.policy.act(env.observe()[:, : tracker.policy.num_obs]))
+    # Hands hold the knobs of doors of all widths.
+    held = env.observe()[:, env.columns["task/knob"]][:, :3].norm(dim=1)
+    assert int((held < 0.2).sum()) >= 6
+    env.close()
+
+
+def test_runs_of_earlier_versions_open_as_they_were() -> None:
+    old = {k: v for k, v in to_data(Compliant()).items() if k in _THEN} | {"reach": 0.2}
+    config = config_of(old)
+    assert (config.length, config.mass, config.tilt, config.spread) == (1.0, 0.5, 0.02, 0.0)
+    play = config.play()
+    assert play.stage and len(play.rods((0.0, 0.0, 0.0))) == 1  # type: ignore[attr-defined]
+    assert config.reach == 0.2 and config.given() is None
+
+
+#: Settings that runs named before scenes without a task were learned.
+_THEN = ("scene", "width", "pushes", "seconds", "level", "stiffness", "forces", "num_envs", "seed")
+
+
 def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     argv = ["train", "compliant", "ball", "-o", str(run), "--envs", "2", "--iterations", "1", "--json"]
@@ -141,4 +230,4 @@ def test_scenes_that_are_not_learned(
     assert main(["train", "compliant", scene, "-o", str(tmp_path / "run")]) == 2
     assert what in capsys.readouterr().err and not (tmp_path / "run").exists()
     with refused("settings-conflict", says="reach"):
-        Compliant(scene="door")
+        Compliant(scene="door", reach=0.0)

@@ -32,6 +32,7 @@ from poise.papers.compliant.scenes import (
     door,
 )
 from poise.papers.compliant.scenes import body_scenes as trampoline
+from poise.papers.compliant.scenes.stage import small_forces
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Scene, SceneSim
 from poise.sim.props import Door
@@ -108,6 +109,40 @@ def test_what_a_door_s_knob_does_and_what_the_task_pays(task: Imitation) -> None
     # exp(-1.5 0.7) = 0.34994 closed, 1 from 0.7 rad on.
     expected = torch.tensor([0.34994, 1.0, 1.0])
     torch.testing.assert_close(door.opened(Seen()), expected, atol=1e-5, rtol=0)  # type: ignore[arg-type]
+
+
+def test_a_hand_is_paid_for_the_arc_of_its_own_door(task: Imitation) -> None:
+    (_, arc) = DoorScene(1.7, made_for=1.0).stage(task.humanoid, task.reference).rewards
+    knob = arc.params["knob"]
+    # Half open, on the arc of this door and 0.1 m off; and while nothing is held.
+    half = 0.5 * door.OPENS
+    middle = 0.5 * (door.GRIPS_S + 0.1 + door.LETS_GO_S - 0.3)
+    x, y = float(knob[0]) - door.AHEAD_M, float(knob[1])
+    held = [x * math.cos(half) + y * math.sin(half), y * math.cos(half) - x * math.sin(half), knob[2]]
+    pos = torch.tensor([held, held, held]) + torch.tensor([[0.0], [0.1], [9.0]])
+
+    class Seen:
+        phase = torch.tensor([middle, middle, 0.5]) / door.LASTS_S
+        sim = SimpleNamespace(pos=pos.unsqueeze(1).expand(3, len(task.humanoid.bodies), 3))
+
+        def source(self, name: str) -> Tensor:
+            return torch.zeros(3, 3)
+
+    paid = arc.fn(Seen(), **arc.params)  # type: ignore[arg-type]
+    torch.testing.assert_close(paid, torch.tensor([1.0, math.exp(-0.3), 1.0]))
+
+
+def test_forces_are_to_stay_small_after_a_blow() -> None:
+    class Seen:
+        torque = torch.tensor([[-4.0, 0.0], [0.0, 0.0], [8.0, -8.0]])
+
+        def source(self, name: str) -> Tensor:
+            told = {"load": [50.0, 0.0, 0.0], "since": [0.0, 0.4, 0.6]}
+            return torch.tensor(told[name])
+
+    paid = small_forces(Seen(), newtons=100.0, newton_metres=20.0)  # type: ignore[arg-type]
+    expected = [0.5 * (math.exp(-0.5) + math.exp(-0.1)), 1.0, 1.0]
+    torch.testing.assert_close(paid, torch.tensor(expected))
 
 
 def test_a_hand_that_keeps_away_from_the_knob_ends_the_episode(task: Imitation) -> None:

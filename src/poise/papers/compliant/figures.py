@@ -16,6 +16,7 @@ from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.motions import standing
+from poise.papers.compliant.scene_training import LearnedOnTop, seen
 from poise.papers.compliant.scenes import Throws
 from poise.recipes.imitation import Imitation
 from poise.sim import Backend, Drive, SimConfig
@@ -192,6 +193,7 @@ def throws(
     seed: int = 0,
     threads: int = 0,
     show: Callable[[int, int], None] | None = None,
+    learned: LearnedOnTop | None = None,
 ) -> Thrown:
     """The same throws at each level, by the policy alone (Deep Compliant Control, Sec. 5.2 and Fig. 4).
 
@@ -203,6 +205,7 @@ def throws(
         count: of throws.
         rate_hz: of the physics; None for the policy's own.
         show: is told how many levels of how many are done.
+        learned: what was learned on top of the policy, which must have learned levels that are drawn.
 
     Raises:
         PoiseError: a level outside of 0 to 1, or a policy that knows no pose at ease.
@@ -216,10 +219,13 @@ def throws(
         task.humanoid, task.reference
     )
     own = replace(task.task, events=stage.events, compliance=given, dones=(), help_by="all")
+    if learned is not None:
+        learned.config.played(given)
+        own = replace(own, obs=(*own.obs, *seen(stage, learned.config)))
     task = replace(task, task=own, props=stage.props, touches=stage.touches)
     found = list[tuple[np.ndarray, ...]]()
     for k, level in enumerate(levels):
-        found.append(_at(tracker, task, count, threads, level))
+        found.append(_at(tracker, task, count, threads, level, learned))
         if show is not None:
             show(k + 1, len(levels))
     columns = (np.stack(c) for c in zip(*found, strict=True))
@@ -227,14 +233,19 @@ def throws(
 
 
 def _at(
-    tracker: Tracker, task: Imitation, count: int, threads: int, level: float
+    tracker: Tracker,
+    task: Imitation,
+    count: int,
+    threads: int,
+    level: float,
+    learned: LearnedOnTop | None,
 ) -> tuple[np.ndarray, ...]:
     """The rows `(M,)` of `Thrown` at one level."""
     env = task.env(count, None, False, threads, help_scale=0.0, guard=False)
     yields = env.event(Yielding)
     part, goal = env.event(ScenePart), env.goal
     assert yields is not None and part is not None and isinstance(goal, DisplacedGoal)
-    throw = part.events[1]
+    throw, policy = part.events[1], tracker.policy if learned is None else learned.over(tracker, env)
     yields.turn(level)
     zero = torch.zeros(count, dtype=torch.long)
     obs, rate = env.reset_to(zero, zero), task.reference.rate_hz
@@ -248,7 +259,7 @@ def _at(
     for step in range(round(LASTS_S * rate) - 1):
         if step == last:
             throw.rows()["left"].fill_(10_000)
-        obs = env.step(tracker.policy.act(obs)).final_obs
+        obs = env.step(policy.act(obs)).final_obs
         sources = part.tells()
         force = sources["peak/hit"].double()
         hit |= force > TOUCHES_N

@@ -177,7 +177,8 @@ def opening(tracker: Tracker, width: float = 1.0) -> Clip:
     rate, ease = float(tracker.config.sim.control_hz), at_ease(tracker)
     frames = round(door.LASTS_S * rate) + 1
     t = np.arange(frames) / rate
-    open_by = door.OPENS * smooth_step(t, door.GRIPS_S + 0.1, door.LETS_GO_S - 0.3)
+    opens_s = door.GRIPS_S + door.OPENING_S[0], door.LETS_GO_S - door.OPENING_S[1]
+    open_by = door.OPENS * smooth_step(t, *opens_s)
     radius = door.Door(width=width).knob[1]
     # From where the knob is closed: x = r sin(phi), y = -r (1 - cos(phi)).
     knob = np.stack((radius * np.sin(open_by), -radius * (1.0 - np.cos(open_by)), 0.0 * t), 1)

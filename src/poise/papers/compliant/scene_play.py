@@ -26,14 +26,12 @@ from poise.jobs.deliver import Evaluation, make_report, simulated_clip
 from poise.jobs.open import open_run
 from poise.jobs.result import RULE
 from poise.jobs.runs import scored
-from poise.jobs.track import imitation_of
 from poise.jobs.track.controllers import look_ahead
-from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
-from poise.papers.compliant.motions import motion_of, standing
-from poise.papers.compliant.opponents import opposing, rival_stage, weighed
-from poise.papers.compliant.scene_training import LearnedOnTop, Topped, seen
+from poise.papers.compliant.motions import motion_of
+from poise.papers.compliant.opponents import opposing, rival_stage
+from poise.papers.compliant.scene_training import LearnedOnTop, Topped, at_rate, seen, set_up
 from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
 from poise.papers.compliant.watch import Watch, meter_of, words_of
 from poise.plan import LookaheadConfig
@@ -185,7 +183,7 @@ def play(
         count: of episodes, side by side.
         name: of the scene, by default that of its class.
         learned: what was learned on top of the policy, for the character that gives way; it gives way as
-            it has learned to.
+            it has learned to, or by the level that is given where it has learned several.
         controller: the policy alone, or with lookahead, which simulates the scene with all that is going
             to happen in it; not with what was learned on top, nor against an opponent.
         lookahead: how it looks ahead.
@@ -202,36 +200,29 @@ def play(
             code="settings-conflict",
         )
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
-    if scene.rate_hz is not None:
-        sim = replace(tracker.config.sim, rate_hz=max(scene.rate_hz, tracker.config.sim.rate_hz))
-        tracker = replace(tracker, config=replace(tracker.config, sim=sim))
-    own_motion = motion_of(scene, tracker, seconds)
-    if clip is not None and own_motion is not None:
+    tracker = at_rate(scene, tracker)
+    if clip is not None and motion_of(scene, tracker, seconds) is not None:
         raise PoiseError(
             "the scene has a motion of its own",
             name or "play",
             "Leave the clip out",
             code="settings-conflict",
         )
-    clip = clip or own_motion
-    task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
+    task, stage = set_up(scene, tracker, seconds, clip)
     rival: Imitation | None = None
-    if isinstance(scene, Chicken):
-        task = weighed(task, scene.mass)
-    stage = scene.stage(task.humanoid, task.reference)
     if isinstance(scene, Chicken) and scene.against == "rival":
         stage, rival = rival_stage(scene, tracker, stage)
-    task = replace(task, props=stage.props, links=stage.links, touches=stage.touches, floor=stage.floor)
+        task = replace(task, props=stage.props, touches=stage.touches)
     both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
     if learned is not None:
-        given = learned.config.given()
+        given = learned.config.played(given)
     for compliance in (stage.yields(given), None):
         others = () if rival is None else (opposing(rival, tracker, compliance),)
         events = (*stage.events, *others)
         own = replace(task.task, events=events, compliance=compliance, help_by="all")
         top = None if compliance is None else learned
         if top is not None:
-            own = replace(own, obs=(*own.obs, *seen(stage)))
+            own = replace(own, obs=(*own.obs, *seen(stage, top.config)))
         ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
     (imitation, rollouts, looked, evaluation), (_, others, other, _) = both

@@ -6,12 +6,15 @@
 | Sec. 5.3, 5.4 scenes, states and rewards  | `scenes`                                           |
 | Eq. 10 r = w_imit r_imit + w_task r_task  | `task`                                             |
 | Sec. 4 imitation controller               | the universal policy, with a learned one on top    |
+| Eq. 11 imitation of the displaced motion  | the rewards of the policy below, `DisplacedGoal`   |
 | Sec. 4.2 state (s_dyn, u, s_task)         | `seen`: the root, u, and what the scene tells      |
+| Sec. 5.2 levels of compliance             | `Compliant.level`, drawn and seen                  |
 | Sec. 5.4 six fictional forces as actions  | `Compliant.forces`                                 |
 
 The paper's controller learns all of a motion from nothing by an adversarial reward, see
 `imitation_controller`. Here the policy that tracks any motion follows the displaced goal, and the policy
-on top learns what the scene's task asks for beside that.
+on top learns what the scene's task asks for beside that: where nothing is to be done, that forces and
+torques stay small after a blow (`scenes.stage.eased`).
 
 run/
     compliant.json          the settings
@@ -35,14 +38,17 @@ import torch
 from torch import Tensor
 
 from poise.control import Compliance, Stiffness
+from poise.control.compliance import LEVEL
 from poise.env import DoneTerm, ObsTerm, TaskConfig
 from poise.env import observations as obs
 from poise.env.env import ImitationEnv
+from poise.env.frame import Frame
 from poise.env.task import Acts, EnvStep
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker, halved
+from poise.kinematics.rate import read_clip
 from poise.learn import (
     LATEST,
     IterationStats,
@@ -58,10 +64,14 @@ from poise.learn import (
 from poise.learn.checkpoint import PolicyMeta, load_checkpoint, only_writer, save_checkpoint
 from poise.learn.policy import policy_in
 from poise.machine import cores, one_thread
+from poise.motion import Clip
 from poise.papers.compliant import imitation_controller as terms
 from poise.papers.compliant.motions import motion_of, standing
-from poise.papers.compliant.scenes import SCENES, PlayScene, SceneSetup
+from poise.papers.compliant.opponents import weighed
+from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene, SceneSetup
 from poise.papers.compliant.scenes.ball import FictionalForces
+from poise.papers.compliant.scenes.body_scenes import HEAVY_KG, LIGHT_KG
+from poise.papers.compliant.scenes.stage import Given, StartsOff
 from poise.recipes.imitation import Imitation
 from poise.settings import Migration, Range, Share, from_data, to_data, validate
 
@@ -168,18 +178,38 @@ class Topped:
             return self._added.apply(self._env, self._policy.act(obs[:, :seen]), own)
 
 
+#: Scenes with a reward of their own, and those in which forces are to stay small.
+TASKS, EASED = ("ball", "door"), ("throws", "hands", "trampoline", "chicken")
+LEARNED = (*TASKS, *EASED)
+#: Levels that are drawn where none is stated; rad, what an action adds where nothing else is learned.
+LEVELS, REACH = (0.0, 0.2), 0.3
+#: A number, or two between which each episode's is drawn.
+Drawn = float | tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Compliant:
     """Settings of one run.
 
     Attributes:
-        scene: which scene is learned: those with a reward of their own, ball and door.
-        width: m, of the door.
+        scene: which scene is learned: ball, door, throws, hands, trampoline or chicken.
+        policy: file or run folder of the policy below; "" for the one that comes along.
+        clip: file of the motion that is done in the scenes throws and hands; "" stands at ease.
+        width: m, of the door; two numbers draw one between them for each episode, here and below. The
+            motion of doors that are drawn is made for the narrowest.
+        length: m, of the rod that the ball is on.
+        mass: kg, of that ball.
+        tilt: rad, by how much the rod is tilted at first, at random.
+        players: kg, of the chicken fight's player and of its opponent, in whose place a bag comes.
         pushes: N, of pushes at the chest while the ball is balanced.
+        spread: how many times the scene's own spread episodes begin off the motion.
         seconds: s, how long episodes last where the scene's motion has no end of its own.
-        level: level of compliance; None takes what suits the scene.
+        level: level of compliance. Two numbers draw one for each episode, which the policy on top sees;
+            it is then played at any. None takes what suits: ball and door have their own, the others
+            draw between 0 and 0.2.
         stiffness: N/m, a commanded stiffness in place of a level.
-        reach: rad, what an action of 1 adds to each joint; 0 leaves the joints to the policy below.
+        reach: rad, what an action of 1 adds to each joint; 0 leaves the joints to the policy below. None
+            takes 0 where there are fictional forces to learn, else 0.3.
         forces: six fictional forces are actions, where the scene has them.
         imitation_weight: w_imit of Eq. 10.
         task_weight: w_task of Eq. 10.
@@ -188,12 +218,19 @@ class Compliant:
     """
 
     scene: str = "ball"
-    width: float = 1.0
+    policy: str = ""
+    clip: str = ""
+    width: Annotated[Drawn, Range(0.5, 3, rising=True, unit="m")] = 1.0
+    length: Annotated[Drawn, Range(0.1, 5, rising=True, unit="m")] = (0.8, 1.2)
+    mass: Annotated[Drawn, Range(0.01, 50, rising=True, unit="kg")] = (0.25, 1.0)
+    tilt: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.1
+    players: Annotated[tuple[float, float], Range(2, 500, unit="kg")] = (HEAVY_KG, LIGHT_KG)
     pushes: float = 0.0
+    spread: Annotated[float, Range(0, 10)] = 1.0
     seconds: Annotated[float, Range(0.5, 600, unit="s")] = 6.0
-    level: float | None = None
-    stiffness: float | None = None
-    reach: Annotated[float, Range(0, math.pi, unit="rad")] = 0.0
+    level: Annotated[Drawn | None, replace(LEVEL, rising=True)] = None
+    stiffness: Annotated[float | None, Range(0, above=True, unit="N/m")] = None
+    reach: Annotated[float | None, Range(0, math.pi, unit="rad")] = None
     forces: bool = True
     imitation_weight: float = 0.5
     task_weight: float = 0.5
@@ -220,61 +257,129 @@ class Compliant:
                 hint=hint,
                 code="scene-without-reward",
             )
-        if not (self.reach or self.added(0).forces):
+        if self.clip and self.scene not in ("throws", "hands"):
+            raise PoiseError(
+                f"the scene '{self.scene}' has a motion of its own",
+                "compliant",
+                "Leave the clip out",
+                code="settings-conflict",
+            )
+        if not (self.added(0).reach or self.added(0).forces):
             what = "reach must be above 0 where there are no forces to learn, got 0"
             raise PoiseError(what, "compliant", code="settings-conflict")
 
     def added(self, seen: int) -> Added:
         """What is learned on top of a policy that sees so many numbers."""
-        return Added(seen, self.reach, self.forces and self.scene == "ball")
+        forces = self.forces and self.scene == "ball"
+        return Added(seen, (0.0 if forces else REACH) if self.reach is None else self.reach, forces)
 
     def play(self) -> PlayScene:
         """The scene."""
         kind: Any = SCENES[self.scene]
-        given = {"ball": {"pushes": self.pushes, "seed": self.seed}, "door": {"width": self.width}}
-        return kind(**given[self.scene])
+        length, mass, width = (_between(x) for x in (self.length, self.mass, self.width))
+        own, weight = self.players
+        given = {
+            "ball": {
+                "lengths": length, "masses": mass, "spread": self.tilt, "pushes": self.pushes,
+                "seed": self.seed,
+            },
+            "door": {"width": width[0]} if width[0] == width[1] else {
+                "width": width[0], "widths": width, "made_for": width[0],
+            },
+            "chicken": {"mass": own, "other": weight, "seed": self.seed},
+            "throws": {"seed": self.seed},
+        }  # fmt: skip
+        return kind(**given.get(self.scene, {}))
 
-    def given(self) -> Compliance | Stiffness | None:
-        """How the character gives way; None is what suits the scene."""
+    @property
+    def drawn(self) -> tuple[float, float] | None:
+        """The levels between which each episode's is drawn; None where there is one."""
+        if self.stiffness is not None:
+            return None
+        level = LEVELS if self.level is None and self.scene in EASED else self.level
+        return level if isinstance(level, tuple) else None
+
+    def given(self) -> Given | None:
+        """How the character gives way while it learns; None is what suits the scene."""
         if self.stiffness is not None:
             return Stiffness(self.stiffness, 0.5)
-        return None if self.level is None else Compliance(self.level)
+        if self.drawn is not None:
+            return Compliance(self.drawn[1], drawn=self.drawn)
+        return None if self.level is None else Compliance(cast(float, self.level))
+
+    def played(self, asked: Given | None) -> Given | None:
+        """How it gives way where it is played: by the level that is asked for, where it has learned
+        several, else as it has learned to.
+
+        Raises:
+            PoiseError: something else is asked for than it has learned.
+        """
+        own = self.given()
+        if self.drawn is None and asked in (None, own):
+            return own
+        if self.drawn is None:
+            raise PoiseError(
+                "a run gives way as it has learned to",
+                hint="Leave --level, --stiffness out",
+                code="option-not-applicable",
+            )
+        if isinstance(asked, Stiffness):
+            raise PoiseError(
+                "the run has learned levels of compliance, no stiffness",
+                hint="Give --level in place of --stiffness",
+                code="option-not-applicable",
+            )
+        return asked or Compliance()
 
 
-#: Scenes with a reward.
-LEARNED = ("ball", "door")
+def _between(given: Drawn) -> tuple[float, float]:
+    return given if isinstance(given, tuple) else (given, given)
 
 
-def seen(stage: SceneSetup) -> tuple[ObsTerm, ...]:
+def seen(stage: SceneSetup, config: Compliant) -> tuple[ObsTerm, ...]:
     """What the policy on top sees."""
     own = (obs.root_height, obs.root_tilt, obs.root_velocity)
     u = ObsTerm("displacement", terms.displacement)
-    return (*(ObsTerm(f"own/{t.__name__}", t) for t in own), u, *stage.obs)
+    level = () if config.drawn is None else (ObsTerm("level", level_seen),)
+    return (*(ObsTerm(f"own/{t.__name__}", t) for t in own), u, *level, *stage.obs)
+
+
+def level_seen(frame: Frame) -> Tensor:
+    """The level of compliance as a share of the paper's 0.2 `(N, 1)`."""
+    return (frame.source("compliance/level") / LEVELS[1]).float().unsqueeze(1)
 
 
 def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float) -> TaskConfig:
     """The task of the policy below, with what the scene adds to it (Eq. 10)."""
     imitation = tuple(replace(r, weight=config.imitation_weight * r.weight) for r in base.rewards)
-    own = tuple(replace(r, weight=config.task_weight) for r in stage.rewards)
+    share = config.task_weight / sum(r.weight for r in stage.rewards)
+    own = tuple(replace(r, weight=share * r.weight) for r in stage.rewards)
     dones: tuple[DoneTerm, ...] = (*base.dones, *stage.dones)
+    gamma, stands = config.ppo.gamma, not config.clip
+    off = (StartsOff(config.play().starts.times(config.spread)),) if config.spread else ()
     return replace(
         base,
-        obs=(*base.obs, *seen(stage)),
+        obs=(*base.obs, *seen(stage, config)),
         rewards=(*imitation, *own),
         dones=dones,
-        events=stage.events,
+        events=(*off, *stage.events),
         compliance=stage.yields(config.given()),
         help_by="all",
         style=(),
-        first=1.0 if stage.from_start else base.first,
+        first=1.0 if stage.from_start or stands else base.first,
         horizon=round(config.seconds * rate_hz),
-        completion_bonus=0.0,
+        # A ball that falls and a door that is open end their tasks; elsewhere the character goes on.
+        completion_bonus=0.0 if config.scene in TASKS else gamma / (1.0 - gamma),
     )
+
+
+#: What runs of earlier versions did, which do not name these settings.
+_MIGRATION = Migration(absent={"length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0})
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Compliant:
     """The settings that a run holds as JSON data."""
-    return from_data(Compliant, Migration()(data), where)
+    return from_data(Compliant, _MIGRATION(data), where)
 
 
 RECIPE: dict[str, Any] = {"name": "compliant", "config": Compliant}
@@ -300,6 +405,12 @@ class LearnedOnTop:
     top: PolicyBundle
     added: Added
 
+    def over(self, tracker: Tracker, env: ImitationEnv) -> Topped:
+        """Both policies as one that acts in an environment, which observes what `seen` says."""
+        topped = Topped(tracker.policy, self.top, self.added)
+        topped.begin(env)
+        return topped
+
 
 def begin(folder: Path, config: Compliant) -> Compliant:
     """Writes the run file, or reads that of the run that is there.
@@ -321,19 +432,33 @@ def begin(folder: Path, config: Compliant) -> Compliant:
     return config
 
 
+def at_rate(scene: PlayScene, tracker: Tracker) -> Tracker:
+    """The policy at the rate of a scene's physics, where that is above its own."""
+    own = tracker.config.sim
+    if scene.rate_hz is None or scene.rate_hz <= own.rate_hz:
+        return tracker
+    return replace(tracker, config=replace(tracker.config, sim=replace(own, rate_hz=scene.rate_hz)))
+
+
+def set_up(
+    scene: PlayScene, tracker: Tracker, seconds: float, clip: Clip | None = None
+) -> tuple[Imitation, SceneSetup]:
+    """A scene around a policy's body, and its motion: its own one, a clip, or standing for so long."""
+    clip = motion_of(scene, tracker, seconds) or clip
+    made = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
+    if isinstance(scene, Chicken):
+        made = weighed(made, scene.mass)
+    stage = scene.stage(made.humanoid, made.reference)
+    whole = {"props": stage.props, "links": stage.links, "touches": stage.touches, "floor": stage.floor}
+    return replace(made, **whole), stage
+
+
 def scene_task(config: Compliant, tracker: Tracker) -> Imitation:
     """The scene as a task of the tracker's body, with all that a policy on top sees and is paid."""
     scene = config.play()
-    clip = motion_of(scene, tracker, config.seconds)
-    if clip is None:
-        made = standing(tracker, config.seconds + 0.1)
-    else:
-        made = imitation_of(tracker, [place(clip, tracker)])
-    stage = scene.stage(made.humanoid, made.reference)
-    own = task(made.task, stage, config, made.reference.rate_hz)
-    return replace(
-        made, task=own, props=stage.props, links=stage.links, touches=stage.touches, floor=stage.floor
-    )
+    clip = read_clip(config.clip) if config.clip else None
+    made, stage = set_up(scene, at_rate(scene, tracker), config.seconds + 0.1, clip)
+    return replace(made, task=task(made.task, stage, config, made.reference.rate_hz))
 
 
 def train(

@@ -19,7 +19,7 @@ from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
 from poise.env.pushes import Pushes
 from poise.env.reference import Reference
-from poise.env.scene_events import InScene, RandomEvent, Switch, near
+from poise.env.scene_events import InScene, RandomEvent, Switch, Varied, near
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.motion.rotations import heading_quat, into_heading, quat_rotate
@@ -39,11 +39,15 @@ UP_M = 0.2
 NEAR_M = 0.15
 #: N for a fictional force of 1 that a policy asks for, and the most of one.
 UNIT_N, MOST_N = 100.0, 150.0
+#: Makes of a rod that is drawn for each episode, and a number without a factor in common with it.
+MAKES, APART = 16, 7
 #: Of the linear law, N/m and N s/m.
 GAIN, DAMPING = 700.0, 250.0
+#: The length of each world's rod, as terms read it.
+LENGTH = "rod/length"
 #: Of the angle at which a rod counts as fallen.
 COS_45 = math.cos(math.pi / 4)
-FLAT = torch.tensor([1.0, 1.0, 0.0])
+FLAT, UPWARD = torch.tensor([1.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,8 @@ class Balance:
 
     Attributes:
         length: m, of the rod.
+        lengths: m, between which each episode's rod is drawn; None: all have `length`.
+        masses: kg, between which the ball's is drawn; None: as a `Rod` has it.
         spread: rad, how far it is tilted at first, at random.
         gain, damping: of the linear law, N/m and N s/m.
         pushes: N, of a push at the chest for 0.1 s every 2 to 3 s from all around; 0 is none.
@@ -101,6 +107,8 @@ class Balance:
     starts: ClassVar[Spread] = LINKED
 
     length: Annotated[float, Range(0.1, 5, unit="m")] = USUAL_M
+    lengths: Annotated[tuple[float, float] | None, Range(0.1, 5, rising=True, unit="m")] = None
+    masses: Annotated[tuple[float, float] | None, Range(0.01, 50, rising=True, unit="kg")] = None
     spread: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.02
     gain: float = GAIN
     damping: float = DAMPING
@@ -127,29 +135,44 @@ class Balance:
         head = heads[-1]
         pose = reference.pose
         x, y, z = (float(v) for v in pose.pos[0, head])
-        top = Rod(length=self.length, pos=(x, y, z + UP_M))
+        rods = self.rods((x, y, z + UP_M))
+        top, longest = rods[0], max(rod.length for rod in rods)
         # The rod's foot above the head, in the head's own frame.
         up = torch.tensor([0.0, 0.0, UP_M])
         to = quat_rotate(pose.quat[0, head] * torch.tensor([1.0, -1.0, -1.0, -1.0]), up)
         a, b, c = (float(v) for v in to)
         link = Link("stands", humanoid.bodies[head], top.name, "ball", to=(a, b, c))
-        close = near(humanoid.bodies[head], top.name, UP_M + self.length + NEAR_M)
+        close = near(humanoid.bodies[head], top.name, UP_M + longest + NEAR_M)
         stands = Switch(link.name, lambda sim: close(sim) & ~leans(sim), leans)
+        # A rod of one make has nothing to draw.
+        told = {LENGTH: torch.tensor([rod.length for rod in rods])}
+        drawn = (Varied(tuple((rod,) for rod in rods), told, self.seed),) if len(rods) > 1 else ()
         part = InScene(
             sees=(top.name,),
-            events=(Tilted(top, self.spread, self.seed), stands),
+            events=(*drawn, Tilted(top, self.spread, self.seed), stands),
         )
         chest = (humanoid.rows_of("spine") or (0,))[-1]
         force, rate = (self.pushes, self.pushes), reference.rate_hz
         push = Pushes(force, (2.0, 3.0), 0.1, (chest,), rate, self.seed)
         pushes = (push,) if self.pushes else ()
-        known = {"head": head, "length": self.length}
+        known = {"head": head, "length": None if drawn else top.length}
         return SceneSetup(
             (top,), (link,), (), (part, *pushes, FictionalForces(self, head)),
             (ObsTerm("task/ball", ball_seen, known),),
             (RewardTerm("task/above", above, 0.5, known, imitation=False),),
             (DoneTerm("task/dropped", dropped),), True, yields=fictional,
         )  # fmt: skip
+
+    def rods(self, pos: Vector) -> tuple[Rod, ...]:
+        """The makes of the rod, with the lower end at `pos`: one, or `MAKES` over the lengths and masses
+        that are stated, neither growing with the other."""
+        usual = Rod()
+        lengths, masses = self.lengths or (self.length,) * 2, self.masses or (usual.mass,) * 2
+        if lengths[0] == lengths[1] and masses[0] == masses[1]:
+            return (Rod(length=lengths[0], mass=masses[0], pos=pos),)
+        share = [k / (MAKES - 1) for k in range(MAKES)]
+        m, kg = ([low + s * (high - low) for s in share] for low, high in (lengths, masses))
+        return tuple(Rod(length=m[k], mass=kg[APART * k % MAKES], pos=pos) for k in range(MAKES))
 
 
 def fictional(given: Given | None) -> Given:
@@ -212,14 +235,18 @@ class FictionalForces(StatedEvent[Goal, Backend], Force):
         like, n = backend.state.xpos, backend.num_envs
         self._body = torch.tensor([self.head + 1, 1], device=like.device).repeat(n, 1)
         self._force = like.new_zeros(n, 2, 3)
+        self._length: Tensor | float = self.law.length
+        if self.law.lengths is not None:
+            ball = self._sim.scene.model.geom("rod/ball").id
+            self._length = self._sim.backend.expand("geom_pos")[:, ball, 2:]
 
     def before_step(self, drive: Drive) -> bool:
         """A control step begins: sets the forces that are held for it."""
         law = self.law
-        off, moves = tipped(self._sim, law.length)
+        off, moves = tipped(self._sim, self._length)
         off = off - self._head()
         # A ball that has fallen is let go.
-        up = (off[:, 2:] > 0.5 * law.length).to(off)
+        up = (off[:, 2:] > 0.5 * self._length).to(off)
         one = up * FLAT.to(off) * (law.gain * off + law.damping * moves)
         force = torch.stack((one, one), 1).to(self._force)
         if self.asked is not None:
@@ -240,11 +267,11 @@ class FictionalForces(StatedEvent[Goal, Backend], Force):
         return Felt(self._body, point, self._force, driven=False)
 
 
-def tipped(sim: SceneSim, length: float) -> tuple[Tensor, Tensor]:
-    """`(N, 3)` where the ball is, m, and how fast it moves, m/s."""
+def tipped(sim: SceneSim, length: float | Tensor) -> tuple[Tensor, Tensor]:
+    """`(N, 3)` where the ball is, m, and how fast it moves, m/s. length: m, `(N, 1)` if they differ."""
     place, state = sim.scene.place("rod"), sim.backend.state
     pos, quat = state.xpos[:, place.body], state.xquat[:, place.body]
-    arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
+    arm = quat_rotate(quat, (length * UPWARD.to(quat)).expand_as(pos))
     qvel = state.qvel[:, place.dofs]
     return pos + arm, qvel[:, :3] + torch.linalg.cross(quat_rotate(quat, qvel[:, 3:]), arm)
 
@@ -260,26 +287,38 @@ def upright_of(sim: SceneSim) -> Tensor:
     return quat_rotate(quat, torch.tensor([0.0, 0.0, 1.0]).to(quat).expand(len(quat), 3))[:, 2]
 
 
-def ball_seen(frame: Frame, head: int, length: float) -> Tensor:
+def arm_of(frame: Frame, length: float | None) -> tuple[Tensor, Tensor]:
+    """`(N, 3)` m, the ball from the rod's foot, and what its height is above that of a rod of `USUAL_M`.
+
+    length: m, of all rods; None: of each as `LENGTH` tells.
+    """
+    pos, quat = frame.source("rod/pos"), frame.source("rod/quat")
+    if length is None:
+        every = frame.source(LENGTH).unsqueeze(1) * UPWARD.to(pos)
+    else:
+        every = torch.tensor([0.0, 0.0, length]).to(pos).expand_as(pos)
+    return quat_rotate(quat, every), every - USUAL_M * UPWARD.to(pos)
+
+
+def ball_seen(frame: Frame, head: int, length: float | None) -> Tensor:
     """p and v of ball and rod from the head, in the heading's axes `(N, 12)`, m and m/s.
 
     Heights are those of a rod of `USUAL_M`, so that a policy knows rods of other lengths, too.
     """
     pos, quat, qvel = (frame.source(f"rod/{k}") for k in ("pos", "quat", "qvel"))
-    arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
+    arm, longer = arm_of(frame, length)
     spin, sim = quat_rotate(quat, qvel[:, 3:]), frame.sim
     from_head, moves = pos - sim.pos[:, head], qvel[:, :3] - sim.linvel[:, head]
     turning = torch.linalg.cross(spin, arm)
-    seen = arm - torch.tensor([0.0, 0.0, length - USUAL_M]).to(arm)
+    seen = arm - longer
     rows = (from_head + seen, moves + turning, from_head + 0.5 * seen, moves + 0.5 * turning)
     return into_heading(sim.heading, torch.stack(rows, 1)).flatten(1)
 
 
-def above(frame: Frame, head: int, length: float) -> Tensor:
+def above(frame: Frame, head: int, length: float | None) -> Tensor:
     """r = exp(-2 |p_ball - p_head|^2) along the floor."""
-    pos, quat = frame.source("rod/pos"), frame.source("rod/quat")
-    arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
-    off = (pos + arm - frame.sim.pos[:, head])[:, :2]
+    arm = arm_of(frame, length)[0]
+    off = (frame.source("rod/pos") + arm - frame.sim.pos[:, head])[:, :2]
     return torch.exp(-SHARPNESS * off.square().sum(-1))
 
 

@@ -32,12 +32,14 @@ from poise.env.scene_events import (
 )
 from poise.errors import PoiseError
 from poise.papers.compliant.scenes.stage import (
+    BODY,
     CONTACTS_HZ,
     LINKED,
     STARTS,
     Given,
     SceneSetup,
     as_given,
+    eased,
     hand_of,
 )
 from poise.score import Spread
@@ -89,7 +91,10 @@ class HandInHand:
             felt=("hands",),
             events=(Move(name, self._path(velocity, ahead)), Switch("hands", always)),
         )
-        return SceneSetup((prop,), (Link("hands", name, body, "ball", measured=True),), (), (part,))
+        link = Link("hands", name, body, "ball", measured=True)
+        return SceneSetup(
+            (prop,), (link,), (), (part,), BODY, (eased(humanoid, HELD_SHARE),), from_start=True
+        )
 
     def _path(self, velocity: Tensor, ahead: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
         w = 2.0 * math.pi / self.every_s
@@ -105,6 +110,8 @@ class HandInHand:
         return path
 
 
+#: The usual force of each scene as a share of the character's weight, see `eased`.
+HELD_SHARE, THROWN_SHARE, BUMPED_SHARE, LANDED_SHARE = 0.1, 0.1, 0.5, 1.0
 #: What the other one is called in the scene.
 RIVAL = "rival"
 #: kg, of the paper's players.
@@ -150,13 +157,14 @@ class Chicken:
         touches = (*touches, hit)
         if self.against == "rival":
             part = InScene(metered=(hit.name,), felt=felt)
-            return SceneSetup((), (), touches, (part,), from_start=True)
+            return SceneSetup((), (), touches, (part,), BODY, from_start=True)
         chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
         bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other, soft_s=BAG_S)
         part = InScene(metered=(hit.name,), felt=felt, events=(far, throw))
-        return SceneSetup((bag,), (), touches, (part,), from_start=True)
+        paid = (eased(humanoid, BUMPED_SHARE),)
+        return SceneSetup((bag,), (), touches, (part,), BODY, paid, from_start=True)
 
 
 def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
@@ -246,7 +254,8 @@ class Throws:
                 Throw("ball", humanoid.bodies[chest], self.speed, every_s=self.every_s, seed=self.seed),
             ),
         )
-        return SceneSetup((Ball(mass=self.mass),), (), (*touches, hit), (part,))
+        paid = (eased(humanoid, THROWN_SHARE),)
+        return SceneSetup((Ball(mass=self.mass),), (), (*touches, hit), (part,), BODY, paid)
 
 
 #: s from bounce to bounce, and from a contact on for which the character gives way.
@@ -344,8 +353,10 @@ class TrampolineScene:
             sees=(plate.name,), felt=names, felt_part=dict.fromkeys(names, after_contact),
             events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
         )  # fmt: skip
-        return SceneSetup((plate,), (), touches, (part,), from_start=True,
-                     floor=Plane(BELOW_M), yields=stands_still)  # fmt: skip
+        return SceneSetup(
+            (plate,), (), touches, (part,), BODY, (eased(humanoid, LANDED_SHARE),),
+            from_start=True, floor=Plane(BELOW_M), yields=stands_still,
+        )  # fmt: skip
 
 
 def stands_still(given: Given | None) -> Given:

@@ -4,7 +4,7 @@
 # pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -14,7 +14,7 @@ from poise.body import Humanoid
 from poise.env.events import EpisodeStart
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
-from poise.env.scene_events import InScene, SceneEvent, ScenePart, SetDown
+from poise.env.scene_events import InScene, SceneEvent, ScenePart, SetDown, Varied
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
 from poise.papers.compliant.scenes.stage import STARTS, SceneSetup, hand_of
@@ -27,6 +27,11 @@ from poise.sim.props import Door
 GRIPS_S, LETS_GO_S, LASTS_S, OPENS = 1.4, 4.2, 5.0, 0.8
 #: The angle that the task asks for, rad, and how fast the reward falls below it (Sec. 5.4).
 WANTED, SHARPNESS = 0.7, 1.5
+#: s after which the motion's door begins to open and before which it has, from grip and release on;
+#: 1/m^2, how fast the reward falls off the knob's arc.
+OPENING_S, ARC_SHARPNESS = (0.1, 0.3), 10.0
+#: Makes of a door that is drawn for each episode; where each one's knob is, as terms read it.
+MAKES, KNOB = 8, "door/knob"
 #: How near the hand must come to the knob, m.
 NEAR_M = 0.25
 #: s after the hand should be at the knob, until it must be there.
@@ -50,6 +55,7 @@ class DoorScene:
         weight: kg.
         made_for: m, how wide the door is for which the motion is made; None: this one. The paper has its
             character learn at 1 m and try up to 1.7.
+        widths: m, between which each episode's door is drawn; None: all have `width`.
     """
 
     rate_hz: ClassVar[float | None] = None
@@ -58,6 +64,7 @@ class DoorScene:
     width: Annotated[float, Range(0, 10, above=True, below=True, unit="m")] = 1.0
     weight: Annotated[float, Range(0, 1000, above=True, below=True, unit="kg")] = 20.0
     made_for: Annotated[float, Range(0.5, 3, unit="m")] | None = None
+    widths: Annotated[tuple[float, float] | None, Range(0.5, 3, rising=True, unit="m")] = None
 
     def __post_init__(self) -> None:
         validate(self, "door")
@@ -69,36 +76,41 @@ class DoorScene:
             PoiseError: no left hand, or a door that is narrower than the body.
         """
         row, broad = hand_of(humanoid, "left", "door"), breadth(humanoid, reference)
-        if self.width < broad:
-            what = f"the door is {self.width:g} m wide and the body {broad:.2f} m: it cannot pass"
+        low, high = self.widths or (self.width,) * 2
+        if low < broad:
+            what = f"the door is {low:g} m wide and the body {broad:.2f} m: it cannot pass"
             raise PoiseError(what, "door", f"Give --width {broad + 0.2:.1f} or more", code="too-narrow")
         frame = min(round(GRIPS_S * reference.rate_hz), int(reference.length[0]) - 1)
-        x, y, z = (float(v) for v in reference.pose.pos[frame, row])
-        door = Door(width=self.width, mass=self.weight, knob_up=z)
-        ahead, along, _ = door.knob
-        door = Door(
-            pos=(x + AHEAD_M - ahead, y - along, 0.0), width=self.width, mass=self.weight, knob_up=z
-        )
-        link = Link(
-            "grip",
-            humanoid.bodies[row],
-            door.name,
-            at=door.knob,
-            turn_m=TURN_M,
-            measured=True,
-            touch=False,
-        )
+        hand = float(reference.pose.pos[frame, row, 0]), float(reference.pose.pos[frame, row, 1])
+        up, many = float(reference.pose.pos[frame, row, 2]), 1 if low == high else MAKES
+        widths = [low + (high - low) * k / max(many - 1, 1) for k in range(many)]
+        makes = tuple(self._make(w, hand, up, humanoid.bodies[row]) for w in widths)
+        door, link = makes[0]
+        told = {KNOB: torch.tensor([leaf.knob for leaf, _ in makes])}
+        drawn = (Varied(makes, told),) if many > 1 else ()
         part = InScene(
             sees=(door.name,), felt=(link.name,), felt_part={link.name: across},
-            events=(SetDown(door.name, (0.0,)), Grip(humanoid.bodies[row], door)),
+            events=(*drawn, SetDown(door.name, (0.0,)), Grip(humanoid.bodies[row], door, many > 1)),
         )  # fmt: skip
-        knob = torch.tensor(door.knob)
+        known = {"row": row, "knob": None if drawn else torch.tensor(door.knob)}
         return SceneSetup(
             (door,), (link,), (), (part,),
-            (ObsTerm("task/phase", phase), ObsTerm("task/knob", knob_seen, {"row": row, "knob": knob})),
-            (RewardTerm("task/open", opened, 0.5, imitation=False),),
-            (DoneTerm("task/missed", missed, {"row": row, "knob": knob}),), from_start=True,
+            (ObsTerm("task/phase", phase), ObsTerm("task/knob", knob_seen, known)),
+            (
+                RewardTerm("task/open", opened, 0.5, imitation=False),
+                RewardTerm("task/arc", on_arc, 0.5, known, imitation=False),
+            ),
+            (DoneTerm("task/missed", missed, known),), from_start=True,
         )  # fmt: skip
+
+    def _make(self, width: float, hand: tuple[float, float], up: float, body: str) -> tuple[Door, Link]:
+        """A door with its knob where the hand comes to, m, and its weld."""
+        (x, y), usual = hand, Door(width=width, mass=self.weight, knob_up=up)
+        ahead, along, _ = usual.knob
+        door = replace(usual, pos=(x + AHEAD_M - ahead, y - along, 0.0))
+        at = door.knob
+        link = Link("grip", body, door.name, at=at, turn_m=TURN_M, measured=True, touch=False)
+        return door, link
 
 
 def breadth(humanoid: Humanoid, reference: Reference) -> float:
@@ -131,15 +143,42 @@ def phase(frame: Frame) -> Tensor:
     return frame.phase.unsqueeze(1)
 
 
-def knob_seen(frame: Frame, row: int, knob: Tensor) -> Tensor:
-    """The knob from the hand, in the hand's axes, and how far the door is open `(N, 4)`, m and rad."""
+def knob_seen(frame: Frame, row: int, knob: Tensor | None) -> Tensor:
+    """The knob from the hand, in the hand's axes, and how far the door is open `(N, 4)`, m and rad.
+
+    knob: `(3,)` m in the leaf's frame, of all doors; None: of each as `KNOB` tells.
+    """
     quat, pos = frame.source("door/quat"), frame.source("door/pos")
-    there = pos + quat_rotate(quat, knob.to(pos).expand_as(pos)) - frame.sim.pos[:, row]
+    there = pos + quat_rotate(quat, _knob(frame, knob)) - frame.sim.pos[:, row]
     seen = quat_rotate(quat_conj(frame.sim.quat[:, row]), there)
     return torch.cat((seen, angle(frame).unsqueeze(1)), 1)
 
 
-def missed(frame: Frame, row: int, knob: Tensor) -> Tensor:
+def _knob(frame: Frame, knob: Tensor | None) -> Tensor:
+    """`(N, 3)` m, in the leaf's frame."""
+    pos = frame.source("door/pos")
+    return (frame.source(KNOB) if knob is None else knob).to(pos).expand_as(pos)
+
+
+def on_arc(frame: Frame, row: int, knob: Tensor | None) -> Tensor:
+    """r = exp(-10 |p_hand - p|^2), p where the hand holds the knob of this door, turned about its hinge
+    by the angle at which the motion has its own one; 1 while the motion does not hold it.
+
+    So a hand that follows the motion along the arc of another door is paid for the arc of this one.
+    """
+    seconds = frame.phase * LASTS_S
+    first, last = GRIPS_S + OPENING_S[0], LETS_GO_S - OPENING_S[1]
+    x = ((seconds - first) / (last - first)).clamp(0.0, 1.0)
+    half = 0.5 * OPENS * x * x * x * (10.0 + x * (6.0 * x - 15.0))
+    nothing = torch.zeros_like(half)
+    turn = torch.stack((half.cos(), nothing, nothing, -half.sin()), 1)
+    held = _knob(frame, knob) - torch.tensor([AHEAD_M, 0.0, 0.0]).to(half)
+    off = frame.source("door/pos") + quat_rotate(turn, held) - frame.sim.pos[:, row]
+    reward = torch.exp(-ARC_SHARPNESS * off.square().sum(-1))
+    return torch.where((seconds > GRIPS_S) & (seconds < LETS_GO_S), reward, 1.0)
+
+
+def missed(frame: Frame, row: int, knob: Tensor | None) -> Tensor:
     """The hand is not at the knob while the motion has it there `(N,)`.
 
     A hand that is held costs balance and the door's reward is not nothing for a closed one: without this
@@ -167,16 +206,25 @@ class Grip(SceneEvent):
     Attributes:
         hand: the body.
         door: the prop.
+        varied: whether worlds have doors of different widths.
     """
 
     hand: str
     door: Door
+    varied: bool = False
 
     def enter(self, sim: SceneSim, control_hz: float) -> None:
         self._sim, self._hz = sim, control_hz
-        self._hand, self._knob = sim.scene.model.body(self.hand).id, torch.tensor(self.door.knob)
+        self._hand = sim.scene.model.body(self.hand).id
         self._leaf = sim.scene.place(self.door.name).body
-        self._row = [link.name for link in sim.scene.scene.links].index("grip")
+        links = sim.scene.scene.links
+        self._row = [link.name for link in links].index("grip")
+        knob = torch.tensor(self.door.knob).to(sim.backend.device)
+        self._knob = knob.expand(sim.num_envs, 3)
+        if self.varied:
+            # Where the weld's hook is on each world's leaf.
+            hook = sim.scene.model.site(links[self._row].hook).id
+            self._knob = sim.backend.expand("site_pos")[:, hook]
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=sim.backend.device)
 
     def rows(self) -> dict[str, Tensor]:
@@ -194,10 +242,10 @@ class Grip(SceneEvent):
             self._sim.switch("grip", False, rows)
         due = ~on & (seconds >= GRIPS_S) & (seconds < LETS_GO_S)
         quat = state.xquat[:, self._leaf].double()
-        knob = state.xpos[:, self._leaf] + quat_rotate(quat, self._knob.to(quat).expand(len(quat), 3))
+        knob = state.xpos[:, self._leaf] + quat_rotate(quat, self._knob.to(quat))
         close = (state.xpos[:, self._hand] - knob).norm(dim=-1) < NEAR_M
         if len(rows := (due & close).nonzero().squeeze(-1)):
-            self._sim.switch("grip", True, rows)
+            self._sim.switch("grip", True, rows, self._knob[rows])
         return False
 
     def after_step(self) -> None:

@@ -1,15 +1,23 @@
 """The set-up of a scene of compliance in each world, and its events."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import Event
-from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
+from poise.env import observations as obs
+from poise.env.events import EpisodeStart, Event, StatedEvent
+from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
 from poise.env.reference import Reference
 from poise.errors import PoiseError
@@ -55,6 +63,56 @@ STARTS = Spread(0.02, 0.05, 0.1, 0.1, math.radians(10.0))
 LINKED = Spread(0.02, 0.0, 0.1, 0.1)
 #: Hz, of scenes in which bodies meet (Sec. 5.2).
 CONTACTS_HZ = 600.0
+#: m/s^2; s for which a blow counts after the last force (Fig. 4 looks at as much).
+G, AFTER_S = 9.81, 0.5
+#: m: the usual torque of a hinge, mean of all, is a character's weight at such an arm.
+ARM_M = 0.03
+#: The state of a policy that moves the joints in a scene without a task of its own.
+BODY = tuple(
+    ObsTerm(f"own/{t.__name__}", t) for t in (obs.joint_angles, obs.joint_velocities, obs.target_joints)
+)
+
+
+@dataclass(frozen=True)
+class StartsOff(StatedEvent[Goal, Backend], Event):
+    """Episodes begin off the motion: given to `TaskConfig.events`.
+
+    Attributes:
+        spread: by how much.
+    """
+
+    spread: Spread
+
+    def enter(self, goal: Goal, backend: Backend) -> None:
+        """It keeps nothing of its worlds."""
+
+    def begin(self, episodes: EpisodeStart) -> None:
+        qpos, qvel = (x.clone() for x in episodes.start)
+        seed = int(torch.randint(2**31, (1,), generator=episodes.rng))
+        rng = np.random.default_rng(seed)
+        for i in range(len(qpos)):
+            self.spread.move(qpos[i], qvel[i], rng)
+        episodes.start = qpos, qvel
+
+
+def eased(humanoid: Humanoid, share: float) -> RewardTerm:
+    """The task of a scene in which nothing is to be done but to give way: that forces stay small.
+
+    r = (exp(-f / F) + exp(-t / T)) / 2 up to `AFTER_S` after something was felt, else 1. f is
+    "load" of `ScenePart`, N, and t the mean size of the hinges' torques, N m; F is the `share` of the
+    character's weight, and T the weight at `ARM_M`.
+    """
+    weight = humanoid.mass * G
+    params = {"newtons": share * weight, "newton_metres": ARM_M * weight}
+    return RewardTerm("task/eased", small_forces, 0.5, params, imitation=False)
+
+
+def small_forces(frame: Frame, newtons: float, newton_metres: float) -> Tensor:
+    """The reward `(N,)` of `eased`."""
+    assert frame.torque is not None
+    force = torch.exp(-frame.source("load") / newtons)
+    torque = torch.exp(-frame.torque.abs().mean(1) / newton_metres)
+    return torch.where(frame.source("since") <= AFTER_S, 0.5 * (force + torque), 1.0)
 
 
 class PlayScene(Protocol):
