@@ -31,6 +31,7 @@ from poise.jobs.track.direction import FrameStiffness, Weight
 from poise.jobs.track.pushed import HeldConfig
 from poise.learn import PPOConfig, Until
 from poise.motion.noise import Drift
+from poise.papers.compliant.scenes import Balance, DoorScene
 from poise.plan import TeacherConfig
 from poise.recipes import ResidualForce
 from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
@@ -42,7 +43,9 @@ from refusals import refused
 
 #: One of each class that cannot be made without arguments, or has no numbers by default.
 EXAMPLES: dict[type, Any] = {
+    Balance: Balance(lengths=(1.0, 1.0), masses=(1.0, 1.0)),
     Compliance: Compliance(joints=(("thigh", 1.0),), drawn=(0.0, 0.1)),
+    DoorScene: DoorScene(widths=(1.0, 1.0)),
     DreamPush: DreamPush(every_s=(1.0, 2.0)),
     FrameStiffness: FrameStiffness(0, 100.0),
     HeldConfig: HeldConfig("left_hand", 1.0),

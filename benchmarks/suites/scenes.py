@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -121,9 +122,9 @@ WAY: dict[str, Given] = {
 
 
 @cache
-def policy() -> Tracker:
-    """The policy that ships."""
-    return open_run(None).tracker
+def policy(of: str = "") -> Tracker:
+    """The policy of a file or run folder, by default that which ships."""
+    return open_run(of or None).tracker
 
 
 # --- stiffness ------------------------------------------------------------------------------------
@@ -198,7 +199,8 @@ def thrown(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
     count = THROWS[unit]
     if places.smoke:
         count, levels = 2, levels[::5]
-    found = throws(policy(), given, levels, count, float(rate), threads=1, learned=top)
+    tracker = policy(top.config.policy if top else "")
+    found = throws(tracker, given, levels, count, float(rate), threads=1, learned=top)
     out: dict[str, Any] = {"levels": list(levels), "fell": found.fell.sum(1).tolist(), "throws": count}
     out["goal_moved_mm"] = (1000 * np.nanmean(found.moved, 1)).tolist()
     for name in ("impulse", "peak", "torque"):
@@ -297,7 +299,7 @@ def played(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
         ways = TOP_LEVELS if top.config.drawn else ("as learned",)
     if places.smoke:
         ways, seconds, many = ways[:1], 1.0, 1
-    tracker = policy()
+    tracker = policy(top.config.policy if top else "")
     clip = read_clip(WALK) if unit.endswith("walking") else None
     if unit.endswith("running"):
         clip = moment() if places.smoke else read_clip(places.data / RUN)
@@ -379,7 +381,10 @@ def on_top(places: Places, unit: str) -> Any:
         raw = thrown(places, case.removeprefix("throws, "), top)
     else:
         raw = played(places, case, top)
-    return raw | {"policy": f"{name} {digest_of(top.top)} (learned on top)"}
+    below, on = stated(_SHIPS), top.config.policy
+    if on:
+        below = f"{Path(on).name} {digest_of(policy(on).policy)}"
+    return raw | {"policy": f"{below}; {name} {digest_of(top.top)} (learned on top)"}
 
 
 def top_rows(places: Places, raws: Raws) -> Iterator[Figure]:
@@ -391,7 +396,7 @@ def top_rows(places: Places, raws: Raws) -> Iterator[Figure]:
         else:
             rows = scene_rows(places, {unit: own})
         for row in rows:
-            yield row._replace(policy=f"{stated(_SHIPS)}; {raw['policy']}")
+            yield row._replace(policy=raw["policy"])
 
 
 def interval(values: list[float], name: str) -> str:

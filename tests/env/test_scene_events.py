@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, ObsTerm
 from poise.env.frame import Frame
-from poise.env.scene_events import InScene, Move, ScenePart, SetDown, Switch, Throw, near
+from poise.env.scene_events import InScene, Move, ScenePart, SetDown, Switch, Throw, Varied, near
 from poise.motion import ClipLibrary
 from poise.papers.compliant.opponents import Teams
 from poise.recipes import ResidualForce, build
@@ -62,6 +62,38 @@ def start(env: ImitationEnv, apart: float = 0.0) -> None:
 
 def still(env: ImitationEnv) -> Tensor:
     return torch.zeros(env.num_envs, env.num_actions)
+
+
+def test_worlds_have_different_makes_of_a_thing_and_go_back_with_a_snapshot(task: Imitation) -> None:
+    doors = tuple(Door(pos=(3.0, 0.0, 0.0), width=w) for w in (0.8, 1.0, 1.4))
+    wide = Varied(tuple((door,) for door in doors), {"width": torch.tensor([0.8, 1.0, 1.4])}, seed=3)
+    scene = Scene((doors[0], Character(task.humanoid)), sim=task.config.sim)
+    sim = SceneSim(scene, num_envs=6, threads=1)
+    env = env_in(task, sim, InScene(events=(wide,)), reset=True)
+
+    def widths() -> list[float]:
+        return [
+            round(2.0 * float(env.backend.get_model(k).geom("door/leaf").size[1]), 6) for k in range(6)
+        ]
+
+    env.reset()
+    part = env.event(ScenePart)
+    assert part is not None
+    told = part.tells()["width"]
+    first = widths()
+    assert set(first) == {0.8, 1.0, 1.4} and told.tolist() == pytest.approx(first)
+    held, state = env.snapshot(), env.state()
+    while widths() == first:
+        env.reset()
+    env.restore(held)
+    assert widths() == first == pytest.approx(told.tolist())
+    env.reset()
+    env.load_state(state)
+    assert widths() == first == pytest.approx(told.tolist())
+    # Every world as the last one.
+    env.restore(env.snapshot(torch.tensor([5])).repeated(6))
+    assert widths() == [first[5]] * 6
+    env.close()
 
 
 def test_a_thing_is_set_down_seen_and_goes_back_with_a_snapshot(task: Imitation) -> None:

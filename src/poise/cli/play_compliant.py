@@ -149,6 +149,8 @@ def run(
             knows = None if chosen and knows is not None and knows.config.drawn is None else knows
         else:
             knows = None if str(learned) == "none" else open_learned(learned, tracker)
+            if knows is not None and knows.config.policy and policy is None:
+                tracker = open_run(knows.config.policy).tracker
     if knows is not None and knows.config.scene != scene:
         what = f"the run learned the scene '{knows.config.scene}', not '{scene}'"
         raise PoiseError(

@@ -185,7 +185,8 @@ def test_rods_and_doors_are_drawn_for_each_episode(tracker: Tracker) -> None:
 def test_runs_of_earlier_versions_open_as_they_were() -> None:
     old = {k: v for k, v in to_data(Compliant()).items() if k in _THEN} | {"reach": 0.2}
     config = config_of(old)
-    assert (config.length, config.mass, config.tilt, config.spread) == (1.0, 0.5, 0.02, 0.0)
+    then = (config.arc, config.length, config.mass, config.tilt, config.spread)
+    assert then == (0.0, 1.0, 0.5, 0.02, 0.0)
     play = config.play()
     assert play.stage and len(play.rods((0.0, 0.0, 0.0))) == 1  # type: ignore[attr-defined]
     assert config.reach == 0.2 and config.given() is None

@@ -194,9 +194,10 @@ class Compliant:
     Attributes:
         scene: which scene is learned: ball, door, throws, hands, trampoline or chicken.
         policy: file or run folder of the policy below; "" for the one that comes along.
-        clip: file of the motion that is done in the scenes throws and hands; "" stands at ease.
+        clip: file of the motion that is done; "" stands at ease. Door and chicken have their own.
         width: m, of the door; two numbers draw one between them for each episode, here and below. The
             motion of doors that are drawn is made for the narrowest.
+        arc: share of the door's task that is paid for a hand on the knob's arc.
         length: m, of the rod that the ball is on.
         mass: kg, of that ball.
         tilt: rad, by how much the rod is tilted at first, at random.
@@ -221,6 +222,7 @@ class Compliant:
     policy: str = ""
     clip: str = ""
     width: Annotated[Drawn, Range(0.5, 3, rising=True, unit="m")] = 1.0
+    arc: Share = 0.5
     length: Annotated[Drawn, Range(0.1, 5, rising=True, unit="m")] = (0.8, 1.2)
     mass: Annotated[Drawn, Range(0.01, 50, rising=True, unit="kg")] = (0.25, 1.0)
     tilt: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.1
@@ -257,7 +259,7 @@ class Compliant:
                 hint=hint,
                 code="scene-without-reward",
             )
-        if self.clip and self.scene not in ("throws", "hands"):
+        if self.clip and self.scene in ("door", "chicken"):
             raise PoiseError(
                 f"the scene '{self.scene}' has a motion of its own",
                 "compliant",
@@ -283,8 +285,9 @@ class Compliant:
                 "lengths": length, "masses": mass, "spread": self.tilt, "pushes": self.pushes,
                 "seed": self.seed,
             },
-            "door": {"width": width[0]} if width[0] == width[1] else {
-                "width": width[0], "widths": width, "made_for": width[0],
+            "door": {
+                "width": width[0], "arc": self.arc,
+                **({"widths": width, "made_for": width[0]} if width[0] < width[1] else {}),
             },
             "chicken": {"mass": own, "other": weight, "seed": self.seed},
             "throws": {"seed": self.seed},
@@ -374,7 +377,7 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
 
 
 #: What runs of earlier versions did, which do not name these settings.
-_MIGRATION = Migration(absent={"length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0})
+_MIGRATION = Migration(absent={"arc": 0.0, "length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0})
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Compliant:
@@ -471,7 +474,8 @@ def train(
     tensorboard: bool = True,
 ) -> RunResult:
     """Trains until a limit; goes on where a run of the folder stopped."""
-    task = scene_task(begin(folder, config), tracker)
+    task = scene_task(config, tracker)
+    begin(folder, config)
     env = task.env(config.num_envs, config.seed, threads=threads, help_scale=0.0, guard=False)
     added = config.added(tracker.policy.num_obs)
     with only_writer(folder):

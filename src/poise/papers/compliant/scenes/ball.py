@@ -295,9 +295,9 @@ def arm_of(frame: Frame, length: float | None) -> tuple[Tensor, Tensor]:
     pos, quat = frame.source("rod/pos"), frame.source("rod/quat")
     if length is None:
         every = frame.source(LENGTH).unsqueeze(1) * UPWARD.to(pos)
-    else:
-        every = torch.tensor([0.0, 0.0, length]).to(pos).expand_as(pos)
-    return quat_rotate(quat, every), every - USUAL_M * UPWARD.to(pos)
+        return quat_rotate(quat, every), every - USUAL_M * UPWARD.to(pos)
+    arm, longer = (torch.tensor([0.0, 0.0, m]).to(pos) for m in (length, length - USUAL_M))
+    return quat_rotate(quat, arm.expand_as(pos)), longer
 
 
 def ball_seen(frame: Frame, head: int, length: float | None) -> Tensor:

@@ -19,7 +19,7 @@ from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
 from poise.papers.compliant.scenes.stage import STARTS, SceneSetup, hand_of
 from poise.score import Spread
-from poise.settings import Range, validate
+from poise.settings import Range, Share, validate
 from poise.sim import Drive, Link, SceneSim
 from poise.sim.props import Door
 
@@ -56,6 +56,8 @@ class DoorScene:
         made_for: m, how wide the door is for which the motion is made; None: this one. The paper has its
             character learn at 1 m and try up to 1.7.
         widths: m, between which each episode's door is drawn; None: all have `width`.
+        arc: share of the task's reward that is paid for a hand on the knob's arc, see `on_arc`; none in
+            the paper, which pays for the angle alone.
     """
 
     rate_hz: ClassVar[float | None] = None
@@ -65,6 +67,7 @@ class DoorScene:
     weight: Annotated[float, Range(0, 1000, above=True, below=True, unit="kg")] = 20.0
     made_for: Annotated[float, Range(0.5, 3, unit="m")] | None = None
     widths: Annotated[tuple[float, float] | None, Range(0.5, 3, rising=True, unit="m")] = None
+    arc: Share = 0.5
 
     def __post_init__(self) -> None:
         validate(self, "door")
@@ -97,8 +100,8 @@ class DoorScene:
             (door,), (link,), (), (part,),
             (ObsTerm("task/phase", phase), ObsTerm("task/knob", knob_seen, known)),
             (
-                RewardTerm("task/open", opened, 0.5, imitation=False),
-                RewardTerm("task/arc", on_arc, 0.5, known, imitation=False),
+                RewardTerm("task/open", opened, 1.0 - self.arc, imitation=False),
+                RewardTerm("task/arc", on_arc, self.arc, known, imitation=False),
             ),
             (DoneTerm("task/missed", missed, known),), from_start=True,
         )  # fmt: skip
