@@ -31,7 +31,7 @@ from poise.jobs.track.direction import FrameStiffness, Weight
 from poise.jobs.track.pushed import HeldConfig
 from poise.learn import PPOConfig, Until
 from poise.motion.noise import Drift
-from poise.papers.compliant.scenes import Balance, DoorScene
+from poise.papers.compliant.scenes import Balance, DoorScene, TrampolineScene
 from poise.plan import TeacherConfig
 from poise.recipes import ResidualForce
 from poise.recipes.perpetual_settings import Perpetual, RecoveryPlan
@@ -62,6 +62,7 @@ EXAMPLES: dict[type, Any] = {
     Stiffness: Stiffness(schedule=((1, 100.0),)),
     TaskConfig: TaskConfig((), (), (), PDTargets()),
     Throw: Throw("ball", "somebody"),
+    TrampolineScene: TrampolineScene(heights=(0.1, 0.1)),
     Until: Until(iterations=1),
     WalkPath: WalkPath(((0.0, 0.0), (1.0, 1.0)), 1.0),
     Weight: Weight("hands", 1.0),

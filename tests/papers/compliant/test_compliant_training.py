@@ -31,6 +31,8 @@ from poise.papers.compliant.scene_training import (
     train,
 )
 from poise.papers.compliant.scenes.ball import FictionalForces
+from poise.papers.compliant.scenes.body_scenes import Bounce
+from poise.papers.compliant.watch import part_of
 from poise.settings import to_data
 from refusals import refused
 
@@ -130,6 +132,9 @@ def test_scenes_without_a_task_learn_to_give_way(tracker: Tracker, scene: str) -
     assert bool(((paid > 0.0) & (paid <= 1.0)).all()) and bool(step.reward.isfinite().all())
     if scene == "hands":
         assert float(paid.max()) < 0.9
+    if scene == "trampoline":
+        bounce = next(e for e in part_of(env).events if isinstance(e, Bounce))
+        assert 0.05 <= float(bounce.rises.min()) < float(bounce.rises.max()) <= 0.2
     top.close()
 
 

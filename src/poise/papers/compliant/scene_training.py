@@ -126,8 +126,12 @@ class OnTop:
         self._seen = env.observe()[:, : added.seen].clone()
 
     def reset(self) -> Tensor:
-        """New episodes everywhere."""
-        return self._own(self.env.reset())
+        """New episodes everywhere, which are over at different times, so that no update is made of one
+        moment of the scene alone."""
+        obs, env = self.env.reset(), self.env
+        ages = torch.randint(env.task.horizon, (env.num_envs,), generator=env.goal.rng)
+        env.age.copy_(ages)
+        return self._own(obs)
 
     @one_thread()
     def step(self, actions: Tensor) -> EnvStep:
@@ -201,6 +205,7 @@ class Compliant:
         length: m, of the rod that the ball is on.
         mass: kg, of that ball.
         tilt: rad, by how much the rod is tilted at first, at random.
+        height: m, by which the trampoline rises for a bounce.
         players: kg, of the chicken fight's player and of its opponent, in whose place a bag comes.
         pushes: N, of pushes at the chest while the ball is balanced.
         spread: how many times the scene's own spread episodes begin off the motion.
@@ -226,6 +231,7 @@ class Compliant:
     length: Annotated[Drawn, Range(0.1, 5, rising=True, unit="m")] = (0.8, 1.2)
     mass: Annotated[Drawn, Range(0.01, 50, rising=True, unit="kg")] = (0.25, 1.0)
     tilt: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.1
+    height: Annotated[Drawn, Range(0, 1, rising=True, unit="m")] = (0.05, 0.2)
     players: Annotated[tuple[float, float], Range(2, 500, unit="kg")] = (HEAVY_KG, LIGHT_KG)
     pushes: float = 0.0
     spread: Annotated[float, Range(0, 10)] = 1.0
@@ -291,6 +297,7 @@ class Compliant:
             },
             "chicken": {"mass": own, "other": weight, "seed": self.seed},
             "throws": {"seed": self.seed},
+            "trampoline": {"heights": _between(self.height)},
         }  # fmt: skip
         return kind(**given.get(self.scene, {}))
 

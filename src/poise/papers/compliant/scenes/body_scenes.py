@@ -328,6 +328,7 @@ class TrampolineScene:
     Attributes:
         height: m, by which the actuators rise for a bounce.
         first: s, when the first bounce begins.
+        heights: m, between which each episode's height is drawn; None: all have `height`.
     """
 
     rate_hz: ClassVar[float | None] = CONTACTS_HZ
@@ -335,6 +336,7 @@ class TrampolineScene:
 
     height: Annotated[float, Range(0, 1, unit="m")] = 0.15
     first: Annotated[float, Range(0, EVERY_S, below=True, unit="s")] = 1.0
+    heights: Annotated[tuple[float, float] | None, Range(0, 1, rising=True, unit="m")] = None
 
     def __post_init__(self) -> None:
         validate(self, "trampoline")
@@ -348,7 +350,7 @@ class TrampolineScene:
         feet = tuple(humanoid.bodies[i] for i in humanoid.feet)
         touches = touches_of("felt", plate.name, feet)
         names = tuple(t.name for t in touches)
-        bounce = Bounce(plate.name, self.height, names, self.first)
+        bounce = Bounce(plate.name, self.height, names, self.first, self.heights)
         part = InScene(
             sees=(plate.name,), felt=names, felt_part=dict.fromkeys(names, after_contact),
             events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
@@ -382,12 +384,14 @@ class Bounce(SceneEvent):
         height: m.
         touches: of the feet with it.
         first: s, when the first bounce begins.
+        heights: m, between which that of each episode is drawn, `rises` `(N,)`; None: all have `height`.
     """
 
     plate: str
     height: float
     touches: tuple[str, ...]
     first: float = 1.0
+    heights: tuple[float, float] | None = None
 
     def enter(self, sim: SceneSim, control_hz: float) -> None:
         self._sim, self._hz = sim, control_hz
@@ -395,20 +399,25 @@ class Bounce(SceneEvent):
         here = sim.backend.device
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=here)
         self.gives, self.air = torch.zeros_like(self.steps), torch.zeros_like(self.steps)
+        self.rises = torch.full((sim.num_envs,), self.height, dtype=torch.float64, device=here)
 
     def rows(self) -> dict[str, Tensor]:
-        return {"steps": self.steps, "gives": self.gives, "air": self.air}
+        return {"steps": self.steps, "gives": self.gives, "air": self.air, "rises": self.rises}
 
     def begin(self, episodes: EpisodeStart) -> None:
         worlds = episodes.worlds
         for value in (self.steps, self.gives, self.air):
             value[worlds] = 0
+        if self.heights is not None:
+            low, high = self.heights
+            drawn = torch.rand(len(worlds), generator=episodes.rng, dtype=torch.float64)
+            self.rises[worlds] = low + (high - low) * drawn.to(self.rises.device)
 
     def before_step(self, drive: Drive) -> bool:
         since = self.steps / self._hz - self.first
         up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
         ctrl = self._sim.backend.drive.ctrl
-        ctrl[:, self._controls] = self.height * up.to(ctrl).unsqueeze(1)
+        ctrl[:, self._controls] = (self.rises.to(ctrl) * up).unsqueeze(1)
         return False
 
     def after_step(self) -> None:
