@@ -117,6 +117,8 @@ def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
 def test_scenes_without_a_task_learn_to_give_way(tracker: Tracker, scene: str) -> None:
     config = replace(TINY, scene=scene, num_envs=6, seconds=0.5)
     assert config.added(0) == Added(0, 0.3, False) and config.drawn == (0.0, 0.2)
+    assert config.learner(2).std == (0.1, 0.1)
+    assert replace(config, scene="ball", reach=0.2).learner(1).std == (0.1,) + (PPO.std,) * 6
     env = scene_task(config, tracker).env(6, threads=1, help_scale=0.0, guard=False)
     top = OnTop(env, tracker.policy, config.added(tracker.policy.num_obs))
     obs, yields = top.reset(), env.event(Yielding)
@@ -190,8 +192,8 @@ def test_rods_and_doors_are_drawn_for_each_episode(tracker: Tracker) -> None:
 def test_runs_of_earlier_versions_open_as_they_were() -> None:
     old = {k: v for k, v in to_data(Compliant()).items() if k in _THEN} | {"reach": 0.2}
     config = config_of(old)
-    then = (config.arc, config.length, config.mass, config.tilt, config.spread)
-    assert then == (0.0, 1.0, 0.5, 0.02, 0.0)
+    then = (config.arc, config.length, config.mass, config.tilt, config.spread, config.body)
+    assert then == (0.0, 1.0, 0.5, 0.02, 0.0, False) and config.noise == 0.3
     play = config.play()
     assert play.stage and len(play.rods((0.0, 0.0, 0.0))) == 1  # type: ignore[attr-defined]
     assert config.reach == 0.2 and config.given() is None

@@ -7,7 +7,7 @@
 | Eq. 10 r = w_imit r_imit + w_task r_task  | `task`                                             |
 | Sec. 4 imitation controller               | the universal policy, with a learned one on top    |
 | Eq. 11 imitation of the displaced motion  | the rewards of the policy below, `DisplacedGoal`   |
-| Sec. 4.2 state (s_dyn, u, s_task)         | `seen`: the root, u, and what the scene tells      |
+| Sec. 4.2 state (s_dyn, u, s_task)         | `seen`: root, joints, u, and what the scene tells  |
 | Sec. 5.2 levels of compliance             | `Compliant.level`, drawn and seen                  |
 | Sec. 5.4 six fictional forces as actions  | `Compliant.forces`                                 |
 
@@ -197,7 +197,8 @@ class Compliant:
 
     Attributes:
         scene: which scene is learned: ball, door, throws, hands, trampoline or chicken.
-        policy: file or run folder of the policy below; "" for the one that comes along.
+        policy: file or run folder of the policy below, which the command line opens; "" for the one that
+            comes along.
         clip: file of the motion that is done; "" stands at ease. Door and chicken have their own.
         width: m, of the door; two numbers draw one between them for each episode, here and below. The
             motion of doors that are drawn is made for the narrowest.
@@ -216,6 +217,9 @@ class Compliant:
         stiffness: N/m, a commanded stiffness in place of a level.
         reach: rad, what an action of 1 adds to each joint; 0 leaves the joints to the policy below. None
             takes 0 where there are fictional forces to learn, else 0.3.
+        noise: deviation of the actions of joints while they are learned; that of forces is `ppo.std`.
+            More of it hides in the torques what is learned of them.
+        body: whether a policy that moves the joints sees them, and where they are to go.
         forces: six fictional forces are actions, where the scene has them.
         imitation_weight: w_imit of Eq. 10.
         task_weight: w_task of Eq. 10.
@@ -239,6 +243,8 @@ class Compliant:
     level: Annotated[Drawn | None, replace(LEVEL, rising=True)] = None
     stiffness: Annotated[float | None, Range(0, above=True, unit="N/m")] = None
     reach: Annotated[float | None, Range(0, math.pi, unit="rad")] = None
+    noise: Annotated[float, Range(0, 1, above=True)] = 0.1
+    body: bool = True
     forces: bool = True
     imitation_weight: float = 0.5
     task_weight: float = 0.5
@@ -246,7 +252,8 @@ class Compliant:
     num_envs: int = 128
     seed: int = 0
     # The paper's networks. Its rate of 1e-5, its gamma of .95 and its noise of 6 degrees are not taken:
-    # this learns in minutes, over 33 control steps, with a noise of .3 of what an action may add.
+    # this learns in minutes, over 33 control steps, with a noise of .3 of what a force may add and less
+    # of what is added to a joint.
     ppo: PPOConfig = PPOConfig(
         policy_hidden=(256, 256, 256),
         value_hidden=(256, 256, 256),
@@ -280,6 +287,13 @@ class Compliant:
         """What is learned on top of a policy that sees so many numbers."""
         forces = self.forces and self.scene == "ball"
         return Added(seen, (0.0 if forces else REACH) if self.reach is None else self.reach, forces)
+
+    def learner(self, hinges: int) -> PPOConfig:
+        """PPO's settings, with the noise of each action."""
+        added, std = self.added(0), self.ppo.std
+        if not added.reach or not isinstance(std, float | int):
+            return self.ppo
+        return replace(self.ppo, std=(self.noise,) * hinges + (float(std),) * (added.width(0)))
 
     def play(self) -> PlayScene:
         """The scene."""
@@ -348,7 +362,9 @@ def _between(given: Drawn) -> tuple[float, float]:
 
 def seen(stage: SceneSetup, config: Compliant) -> tuple[ObsTerm, ...]:
     """What the policy on top sees."""
-    own = (obs.root_height, obs.root_tilt, obs.root_velocity)
+    own = [obs.root_height, obs.root_tilt, obs.root_velocity]
+    if config.body and config.added(0).reach:
+        own += [obs.joint_angles, obs.joint_velocities, obs.target_joints]
     u = ObsTerm("displacement", terms.displacement)
     level = () if config.drawn is None else (ObsTerm("level", level_seen),)
     return (*(ObsTerm(f"own/{t.__name__}", t) for t in own), u, *level, *stage.obs)
@@ -384,7 +400,11 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
 
 
 #: What runs of earlier versions did, which do not name these settings.
-_MIGRATION = Migration(absent={"arc": 0.0, "length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0})
+_MIGRATION = Migration(
+    absent={
+        "arc": 0.0, "length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0, "body": False, "noise": 0.3
+    }
+)  # fmt: skip
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Compliant:
@@ -487,7 +507,7 @@ def train(
     added = config.added(tracker.policy.num_obs)
     with only_writer(folder):
         trainer = Trainer(
-            cast(VecEnv, OnTop(env, tracker.policy, added)), config.ppo, config.seed,
+            cast(VecEnv, OnTop(env, tracker.policy, added)), config.learner(env.hinges), config.seed,
             task.humanoid.identity, {"recipe": "compliant"}, update_threads=threads or cores(),
         )  # fmt: skip
         try:

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env import observations as obs
 from poise.env.events import EpisodeStart, Event, StatedEvent
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goal import Goal
@@ -67,10 +66,6 @@ CONTACTS_HZ = 600.0
 G, AFTER_S = 9.81, 0.5
 #: m: the usual torque of a hinge, mean of all, is a character's weight at such an arm.
 ARM_M = 0.03
-#: The state of a policy that moves the joints in a scene without a task of its own.
-BODY = tuple(
-    ObsTerm(f"own/{t.__name__}", t) for t in (obs.joint_angles, obs.joint_velocities, obs.target_joints)
-)
 
 
 @dataclass(frozen=True)
