@@ -39,6 +39,7 @@ from poise.papers.compliant.scenes.stage import (
     SceneSetup,
     as_given,
     eased,
+    feels,
     hand_of,
 )
 from poise.score import Spread
@@ -92,7 +93,13 @@ class HandInHand:
         )
         link = Link("hands", name, body, "ball", measured=True)
         return SceneSetup(
-            (prop,), (link,), (), (part,), (), (eased(humanoid, HELD_SHARE),), from_start=True
+            (prop,),
+            (link,),
+            (),
+            (part,),
+            (feels(humanoid),),
+            (eased(humanoid, HELD_SHARE),),
+            from_start=True,
         )
 
     def _path(self, velocity: Tensor, ahead: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
@@ -156,14 +163,14 @@ class Chicken:
         touches = (*touches, hit)
         if self.against == "rival":
             part = InScene(metered=(hit.name,), felt=felt)
-            return SceneSetup((), (), touches, (part,), from_start=True)
+            return SceneSetup((), (), touches, (part,), (feels(humanoid),), from_start=True)
         chest = humanoid.bodies[(humanoid.rows_of("spine") or (0,))[-1]]
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
         bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other, soft_s=BAG_S)
         part = InScene(metered=(hit.name,), felt=felt, events=(far, throw))
         paid = (eased(humanoid, BUMPED_SHARE),)
-        return SceneSetup((bag,), (), touches, (part,), (), paid, from_start=True)
+        return SceneSetup((bag,), (), touches, (part,), (feels(humanoid),), paid, from_start=True)
 
 
 def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
@@ -254,7 +261,9 @@ class Throws:
             ),
         )
         paid = (eased(humanoid, THROWN_SHARE),)
-        return SceneSetup((Ball(mass=self.mass),), (), (*touches, hit), (part,), (), paid)
+        return SceneSetup(
+            (Ball(mass=self.mass),), (), (*touches, hit), (part,), (feels(humanoid),), paid
+        )
 
 
 #: s from bounce to bounce, and from a contact on for which the character gives way.
@@ -355,7 +364,7 @@ class TrampolineScene:
             events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
         )  # fmt: skip
         return SceneSetup(
-            (plate,), (), touches, (part,), (), (eased(humanoid, LANDED_SHARE),),
+            (plate,), (), touches, (part,), (feels(humanoid),), (eased(humanoid, LANDED_SHARE),),
             from_start=True, floor=Plane(BELOW_M), yields=stands_still,
         )  # fmt: skip
 

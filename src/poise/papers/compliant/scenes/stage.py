@@ -102,6 +102,18 @@ def eased(humanoid: Humanoid, share: float) -> RewardTerm:
     return RewardTerm("task/eased", small_forces, 0.5, params, imitation=False)
 
 
+def feels(humanoid: Humanoid) -> ObsTerm:
+    """The state of such a scene: what was felt, and how long ago, without which no value could be told
+    of what comes after a blow where nothing gives way."""
+    return ObsTerm("task/felt", felt_seen, {"newtons": humanoid.mass * G})
+
+
+def felt_seen(frame: Frame, newtons: float) -> Tensor:
+    """ "load" in `newtons` and exp(-t / T) of the time since, T being `AFTER_S`, `(N, 2)`."""
+    since = torch.exp(-frame.source("since") / AFTER_S)
+    return torch.stack((frame.source("load") / newtons, since), 1)
+
+
 def small_forces(frame: Frame, newtons: float, newton_metres: float) -> Tensor:
     """The reward `(N,)` of `eased`."""
     assert frame.torque is not None
