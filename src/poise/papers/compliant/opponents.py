@@ -62,7 +62,7 @@ class Opponent(StatedEvent[Goal, Backend], Event):
         self._rows, self.env = rows, self.make(rows)
         self._zero = torch.zeros(rows.num_envs, dtype=torch.long, device=rows.device)
         self._obs = self.env.reset_to(self._zero, self._zero)
-        self._held: tuple[Tensor, ...] | None = None
+        self._held: tuple[Tensor, ...] = ()
 
     def look(self, ids: Tensor | None) -> None:
         """It begins anew where all worlds do."""
@@ -73,16 +73,16 @@ class Opponent(StatedEvent[Goal, Backend], Event):
         """Its action for the control step that begins."""
         actuation = self.env.controls.actuation
         self.env.drive(self.policy.act(self._obs))
-        more = actuation.before()
-        self._held, self._first = actuation.held(), True
+        more = actuation.before() or actuation.pd.interpolate
+        self._held, self._k = actuation.held(), 0
         self._rows.push()
         return more
 
     def before_substep(self, drive: Drive) -> None:
-        if not self._first:
+        if self._k:
             self._rows.pull()
-        self.env.controls.actuation.substep(None if self._first else self._held)
-        self._first = False
+        self.env.controls.actuation.substep(self._held, self._k, self.env.substeps)
+        self._k += 1
         self._rows.push()
 
     def after_step(self) -> None:
