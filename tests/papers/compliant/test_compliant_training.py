@@ -193,7 +193,7 @@ def test_runs_of_earlier_versions_open_as_they_were() -> None:
     old = {k: v for k, v in to_data(Compliant()).items() if k in _THEN} | {"reach": 0.2}
     config = config_of(old)
     then = (config.arc, config.length, config.mass, config.tilt, config.spread, config.body)
-    assert then == (0.0, 1.0, 0.5, 0.02, 0.0, False) and config.noise == 0.3
+    assert then == (0.0, 1.0, 0.5, 0.02, 0.0, False) and config.learner(9) == config.ppo
     play = config.play()
     assert play.stage and len(play.rods((0.0, 0.0, 0.0))) == 1  # type: ignore[attr-defined]
     assert config.reach == 0.2 and config.given() is None

@@ -217,8 +217,8 @@ class Compliant:
         stiffness: N/m, a commanded stiffness in place of a level.
         reach: rad, what an action of 1 adds to each joint; 0 leaves the joints to the policy below. None
             takes 0 where there are fictional forces to learn, else 0.3.
-        noise: deviation of the actions of joints while they are learned; that of forces is `ppo.std`.
-            More of it hides in the torques what is learned of them.
+        noise: deviation of the actions of joints while they are learned, None for `ppo.std`, that of
+            forces. More of it hides in the torques what is learned of them.
         body: whether a policy that moves the joints sees them, and where they are to go.
         forces: six fictional forces are actions, where the scene has them.
         imitation_weight: w_imit of Eq. 10.
@@ -243,7 +243,7 @@ class Compliant:
     level: Annotated[Drawn | None, replace(LEVEL, rising=True)] = None
     stiffness: Annotated[float | None, Range(0, above=True, unit="N/m")] = None
     reach: Annotated[float | None, Range(0, math.pi, unit="rad")] = None
-    noise: Annotated[float, Range(0, 1, above=True)] = 0.1
+    noise: Annotated[float | None, Range(0, 1, above=True)] = 0.1
     body: bool = True
     forces: bool = True
     imitation_weight: float = 0.5
@@ -291,7 +291,7 @@ class Compliant:
     def learner(self, hinges: int) -> PPOConfig:
         """PPO's settings, with the noise of each action."""
         added, std = self.added(0), self.ppo.std
-        if not added.reach or not isinstance(std, float | int):
+        if not added.reach or self.noise is None or not isinstance(std, float | int):
             return self.ppo
         return replace(self.ppo, std=(self.noise,) * hinges + (float(std),) * (added.width(0)))
 
@@ -402,7 +402,7 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
 #: What runs of earlier versions did, which do not name these settings.
 _MIGRATION = Migration(
     absent={
-        "arc": 0.0, "length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0, "body": False, "noise": 0.3
+        "arc": 0.0, "length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0, "body": False, "noise": None
     }
 )  # fmt: skip
 
