@@ -247,8 +247,8 @@ def cut_loop(
     free = np.arange(clip.frames) - np.maximum.accumulate(np.where(kept, -1, np.arange(clip.frames)))
     pairs: list[tuple[float, int, int]] = []
     for length in range(math.ceil((1 - LENIENT) * wanted), math.floor((1 + LENIENT) * wanted) + 1):
-        ends = np.flatnonzero(free > length + max(joins))
-        if not len(ends) or length <= max(joins):
+        ends = np.flatnonzero(free > length + min(joins))
+        if not len(ends) or length <= min(joins):
             continue
         gap = np.square(alike[ends] - alike[ends - length]).mean(1)
         some = gap.argsort(kind="stable")[:PAIRS]
@@ -262,7 +262,7 @@ def cut_loop(
         )
     best: tuple[float, Clip, float] | None = None
     for _, i, j in sorted(pairs)[:PAIRS]:
-        for frames in joins:
+        for frames in (k for k in joins if k < min(j - i, free[j] - (j - i))):
             made = _joined(clip, i, j, frames)
             seam = _seam(made, frames)
             if best is None or seam < best[0]:
