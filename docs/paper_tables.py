@@ -849,11 +849,20 @@ _BALL = PaperTable(
     ),
     f"{_SCENES} ball",
 )
+_TARGETS = "nothing (targets)"
+
+
+def _planned(kind: str, how: str) -> str:
+    return f"papers:Deep Compliant Control, controller; planner in place, {kind}, {how}"
+
+
 _CONTROLLER = PaperTable(
     (
         Measure("falls a minute", "falls_a_minute", "1", -1),
         Measure("off the root, m", "root_m", "2", -1),
         Measure("off the nearest pose, mm", "nearest_pose_mm", "0", -1),
+        Measure("transitions a minute", "transitions_a_minute", "1"),
+        Measure("share at the goal's clip", "as_the_goal", "%"),
     ),
     (
         *(
@@ -867,9 +876,66 @@ _CONTROLLER = PaperTable(
             )
             for k in (0, 1, 2)
         ),
-        Claim("steps of its own where its hands are pulled", run=""),
-        Claim("transitions between standing, walking and running", run=""),
-        Claim("a backflip", run=""),
+        *(
+            Claim(
+                f"standing, walking, turning, running, {kind} targets",
+                _planned(kind, "from clip to clip"),
+                "better",
+                _planned(_TARGETS, "from clip to clip"),
+                "nothing learned",
+                judged=("falls_a_minute", "as_the_goal"),
+            )
+            for kind in ("absolute", "additive")
+        ),
+    ),
+    f"{_PAPERS} compliant",
+    "Deep Compliant Control, Sec. 5.1; any skill",
+)
+_PULLED, _CALM = "a hand pulled at 0.5 m/s", "nobody pulls"
+_PLANNER = PaperTable(
+    (
+        Measure("steps", "steps", "1"),
+        Measure("along the pull, m", "along_m", "2"),
+        share("lost", "lost", -1),
+    ),
+    tuple(
+        claim
+        for kind in ("absolute", "additive")
+        for claim in (
+            Claim(
+                f"{_PULLED}, {kind} targets",
+                _planned(kind, _PULLED),
+                "better",
+                _planned(_TARGETS, _PULLED),
+                "nothing learned",
+                judged=("steps", "lost"),
+            ),
+            Claim(
+                f"{_PULLED}, {kind} targets",
+                _planned(kind, _PULLED),
+                "better",
+                _planned(kind, _CALM),
+                "where nobody pulls",
+                judged=("steps",),
+            ),
+            Claim(
+                f"{_CALM}, {kind} targets (ours alone)",
+                _planned(kind, _CALM),
+                "better",
+                _planned(_TARGETS, _CALM),
+                "nothing learned",
+                judged=("lost",),
+                printed="no row",
+            ),
+            Claim(
+                f"a backflip, {kind} targets",
+                f"papers:Deep Compliant Control, controller; backflip, {kind}",
+                "better",
+                f"papers:Deep Compliant Control, controller; backflip, {_TARGETS}",
+                "nothing learned",
+                judged=("lost",),
+            ),
+        )
     ),
     f"{_PAPERS} compliant",
     "Deep Compliant Control, Sec. 5.1; any skill",
@@ -1125,6 +1191,7 @@ PAPER_TABLES: dict[str, PaperTable] = {
     "s2h-table-6": _S2H_6,
     "dcc-stiffness": _STIFF,
     "dcc-controller": _CONTROLLER,
+    "dcc-planner": _PLANNER,
     "dcc-figure-4": _FIGURE_4,
     "dcc-slopes": _SLOPES,
     "dcc-hands": _HANDS,

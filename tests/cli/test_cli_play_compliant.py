@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from poise.cli.main import main
+from poise.formats import write_clip
+from toy_human import swing
 
 
 def test_a_scene_from_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,3 +71,28 @@ def test_a_run_of_that_name_is_a_run(
     (tmp_path / "compliant").mkdir()
     assert main(["play", "compliant"]) == 2
     assert "SCENE" not in capsys.readouterr().err
+
+
+def test_the_imitation_controller_from_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clips, run = tmp_path / "clips", tmp_path / "run"
+    clips.mkdir()
+    for name, speed in (("stand", 0.0), ("walk", 1.2)):
+        write_clip(swing(2.0, speed=speed, name=name), clips / f"{name}.bvh")
+    train = ["train", "compliant-imitation", str(clips), "-o", str(run), "--envs", "4", "--threads", "1"]
+    train += ["--iterations", "1", "--set", "ppo.horizon=4", "--set", "ppo.minibatch=16"]
+    assert main(train) == 0
+    assert "poise play compliant hands --learned" in capsys.readouterr().out
+    assert main(train) == 2 and "already holds a run" in capsys.readouterr().err
+    assert main([*train, "--resume"]) == 0
+    capsys.readouterr()
+    assert main(["play", str(run), "--clip", "walk", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["clip"] == "walk"
+    play = ["play", "compliant", "hands", "--learned", str(run), "-o", str(tmp_path / "out")]
+    assert main([*play, "--stiffness", "200"]) == 2
+    assert "--stiffness means nothing" in capsys.readouterr().err
+    assert main([*play, "--lead", "0.5", "--count", "2", "--duration", "0.5", "--threads", "1"]) == 0
+    assert (tmp_path / "out" / "report.html").exists()
+    assert main(["train", "compliant-imitation", "-o", str(tmp_path / "two")]) == 2
+    assert "no clip was given" in capsys.readouterr().err and not (tmp_path / "two").exists()

@@ -20,6 +20,7 @@ from poise.formats import read_clip
 from poise.jobs.endless.endless_training import Endless
 from poise.jobs.inbetween.inbetween_settings import Inbetween
 from poise.jobs.presets import preset_of
+from poise.papers.compliant.imitation_controller import CompliantImitation
 from poise.papers.compliant.scene_training import Compliant
 from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.papers.perpetual.trajopt import TrajOptConfig
@@ -33,6 +34,7 @@ KINDS: dict[str, Any] = {
     "inbetween": Inbetween,
     "endless": Endless,
     "compliant": Compliant,
+    "compliant-imitation": CompliantImitation,
 }
 
 
@@ -99,6 +101,9 @@ def test_python_and_the_command_line_have_the_same_defaults() -> None:
     assert imitates() == ResidualForce() and trains("residual-force") == ResidualForce()
     assert trains("perpetual") == StagedPerpetual() and trains("inbetween") == Inbetween()
     assert trains("endless") == Endless()
+    assert trains("compliant-imitation") == CompliantImitation()
+    paper = trains("compliant-imitation", "--preset", "paper", "--action", "additive")
+    assert paper == CompliantImitation.paper(action="additive")
     assert trains("perpetual", "--action", "additive") == StagedPerpetual.additive()
 
 

@@ -157,6 +157,7 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     from poise.cli.train import RECIPES
     from poise.jobs.inbetween import inbetween_training as inbetween
     from poise.metrics.tracking_errors import RULES
+    from poise.papers.compliant import imitation_controller, scene_training
     from poise.recipes import RECIPE, perpetual
 
     assert get_args(options.Rule) == tuple(RULES)
@@ -165,7 +166,8 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
         inbetween.RECIPE["name"],
         perpetual.RECIPE["name"],
         "endless",
-        "compliant",
+        scene_training.RECIPE["name"],
+        imitation_controller.RECIPE["name"],
     ) == RECIPES
 
 

@@ -27,6 +27,8 @@ from poise.jobs.keep import claimed, may_write
 
 if TYPE_CHECKING:
     from poise.control import Compliance, Stiffness
+    from poise.papers.compliant.controller_run import ControllerRun
+    from poise.papers.compliant.scene_play import Played
     from poise.papers.compliant.scenes import PlayScene
 
 #: What is written into the folder.
@@ -101,6 +103,7 @@ def run(
         seed: throws, ball, chicken: of the draws (0).
         learned: what was learned on top of the policy: the folder of poise train compliant SCENE, at
             --level where it learned levels. For the ball something comes along; none goes without.
+            pull, hands: also that of poise train compliant-imitation, which stands by itself.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the
             scene.
         budget: simulated control steps of lookahead for each that is made, by default 192.
@@ -139,6 +142,25 @@ def run(
         "seed": seed,
     }
     place, given = scene_of(scene, stated), given_of(level, newtons_per_metre, lag)
+    own = None if learned is None else controller_in(learned)
+    if own is not None:
+        for option, value in (
+            ("--clip", clip),
+            ("--stiffness", newtons_per_metre),
+            ("--policy", policy),
+            ("--controller lookahead", controller == "lookahead" or None),
+        ):
+            if value is not None:
+                raise PoiseError(
+                    f"the run of --learned stands and acts by itself, so that {option} means nothing",
+                    learned,
+                    "Leave it out",
+                    code="option-not-applicable",
+                )
+        with claimed(out):
+            with working("simulating"):
+                played = own.play(place, level, count, duration, threads, scene)
+            return told(played, out, given, open)
     motion = None if clip is None else reading.read(clip)
     with working("opening the policy"):
         tracker = open_run(policy).tracker
@@ -162,17 +184,31 @@ def run(
         with working("simulating"):
             more = (count, duration, threads, scene, knows, controller, how)
             played = play(place, tracker, motion, given, *more)
-        with working("writing"):
-            paths = played.write(out)
+        return told(played, out, given, open)
+
+
+def told(played: Played, out: Path, given: Compliance | Stiffness | None, open: bool) -> Answer:
+    """Writes what came of a scene, and says it."""
+    with working("writing"):
+        paths = played.write(out)
     rows = [(played.words[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
-    table(f"{scene}, {count} episodes", ("", "compliant", "without"), rows, left=1)
+    table(f"{played.scene}, {played.count} episodes", ("", "compliant", "without"), rows, left=1)
     say(played.sentence())
     if open and not webbrowser.open(paths["report"].absolute().as_uri()):
         raise PoiseError(
             "no browser could be opened", paths["report"], "Open the page by hand", code="no-browser"
         )
-    result = {"scene": scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
+    result = {"scene": played.scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
     return Answer(result, paths, (*played.notes, *(() if given is None else given.notes)))
+
+
+def controller_in(learned: Path) -> ControllerRun | None:
+    """The run of the imitation controller that a folder holds; None where it holds none."""
+    from poise.jobs.run_file import RUN_FILE
+    from poise.papers.compliant.controller_run import ControllerRun, opened
+
+    run = opened(learned) if (learned / RUN_FILE).exists() else None
+    return run if isinstance(run, ControllerRun) else None
 
 
 def given_of(level: float | None, stiffness: float | None, lag: float) -> Compliance | Stiffness | None:

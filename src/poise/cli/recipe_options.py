@@ -41,6 +41,7 @@ SOURCES = {
     "perpetual": "poise.papers.perpetual.ablations:StagedPerpetual",
     "endless": "poise.jobs.endless.endless_training:Endless",
     "compliant": "poise.papers.compliant.scene_training:Compliant",
+    "compliant-imitation": "poise.papers.compliant.imitation_controller:CompliantImitation",
 }
 #: The dataclass of how a motion is tracked.
 TRACK = "poise.jobs.track_settings:TrackConfig"

@@ -38,7 +38,7 @@ class Options:
     """Train a recipe on one clip, on several clips of one skeleton or on a folder, and no more."""
 
     recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
-    """residual-force, inbetween, perpetual, endless, or compliant."""
+    """residual-force, inbetween, perpetual, endless, compliant, or compliant-imitation."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
     clips: Annotated[
@@ -73,7 +73,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         from poise.cli.train_compliant import run as compliant
 
         return compliant(config, o.out, o.training, again)
-    if o.recipe != "residual-force":
+    if o.recipe not in ("residual-force", "compliant-imitation"):
         _only_a_folder(o)
         from poise.cli.train_endless import run as endless
         from poise.cli.train_inbetween import run as inbetween
@@ -84,12 +84,19 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         if o.recipe == "inbetween":
             return inbetween(o.library, config, o.out, o.training, again)
         return perpetual(o, config, again)
-    if not o.clips:
+    clips = o.clips
+    if o.recipe == "compliant-imitation" and o.library.library is not None:
+        clips = (*clips, o.library.library)
+    if not clips:
         raise PoiseError(
             "no clip was given",
             hint=f"Write poise train {o.recipe} CLIP -o RUNDIR",
             code="argument-missing",
         )
+    if o.recipe == "compliant-imitation":
+        from poise.cli.train_compliant import controller
+
+        return controller(config, clips, o.reading, o.out, o.training, again)
     from poise.jobs.imitate import Job
     from poise.jobs.practice import Watching
 

@@ -252,9 +252,11 @@ def _folder(folder: Path) -> Run:
     file = RunFile(path, meta, tensors)
     known = {PERPETUAL["name"]: perpetual_config, RESIDUAL_FORCE["name"]: config_of}
     if file.recipe not in known:
+        hint = "Runs of compliant-imitation are for poise play and poise eval"
         raise PoiseError(
-            f"there is no recipe '{json.dumps(file.recipe)[1:40]}'", path, code="unknown-recipe"
-        )
+            f"there is no recipe '{json.dumps(file.recipe)[1:-1][:40]}' here", path, hint,
+            code="unknown-recipe",
+        )  # fmt: skip
     return Run(folder, file.recipe, known[file.recipe](meta["config"], path), file)
 
 

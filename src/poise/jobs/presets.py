@@ -18,6 +18,7 @@ def _endless() -> Any:
     return imported("poise.jobs.endless.endless_training:Endless")
 
 
+_CONTROLLER = "poise.papers.compliant.imitation_controller:CompliantImitation"
 #: The names of presets.
 NAMES = ("paper", "code", "fast")
 
@@ -34,12 +35,15 @@ _PRESETS: dict[str, dict[str, Callable[..., Any]]] = {
         "fast": lambda _: small(Inbetween()),
     },
     "endless": {"paper": lambda _: _endless().paper(), "fast": lambda _: _endless()()},
+    "compliant-imitation": {
+        "paper": lambda _: imported(_CONTROLLER).paper(), "fast": lambda _: imported(_CONTROLLER)(),
+    },
 }  # fmt: skip
 
 
 def preset_of(recipe: str, name: str, clip: Clip | None = None) -> Any:
-    """The settings of a recipe ("residual-force", "perpetual", "inbetween" or
-    "endless") by the name of a preset.
+    """The settings of a recipe ("residual-force", "perpetual", "inbetween", "endless" or
+    "compliant-imitation") by the name of a preset.
 
     clip: what is imitated, by which the paper chooses its reward and the code its damping.
 

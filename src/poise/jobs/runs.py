@@ -127,7 +127,7 @@ def help_left(
 
     asked: N; by default what training has left of it (`meta["help_limit"]`).
     """
-    most = 0.0 if imitation.config.method == "deepmimic" else most_help(imitation.config)
+    most = 0.0 if imitation.task.residual is None else most_help(imitation.config)
     limit = min(most, float(meta.get("help_limit", most))) if asked is None else asked
     if not 0 <= limit <= most:
         raise PoiseError(

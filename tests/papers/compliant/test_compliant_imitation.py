@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +12,20 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.env.yielding import DisplacedGoal
-from poise.learn import Amp, AmpConfig
+from poise.learn import Amp, AmpConfig, Until
 from poise.learn.amp import mixed_reward
+from poise.motion import ClipLibrary
 from poise.motion.rotations import into_heading
 from poise.papers.compliant import imitation_controller as compliant
-from poise.papers.compliant.imitation_controller import CompliantImitation, build, config_of
+from poise.papers.compliant.controller_run import begin, opened, train
+from poise.papers.compliant.imitation_controller import (
+    CompliantImitation,
+    build,
+    chained,
+    config_of,
+    trainer,
+)
+from poise.papers.compliant.scenes.body_scenes import HandInHand, Throws
 from poise.recipes.imitation import Imitation
 from poise.settings import to_data
 from refusals import refused
@@ -127,6 +137,56 @@ def test_it_trains_and_goes_on_bit_for_bit(changes: dict[str, object], tmp_path)
     assert "env/shifted/before" in a
     for name in a.keys() - {"trainer/counters"}:
         assert torch.equal(a[name].nan_to_num(-1), b[name].nan_to_num(-1)), name
+
+
+def several() -> ClipLibrary:
+    return ClipLibrary((swing(2.0, name="stand"), swing(2.0, speed=1.2, bend=0.5, name="walk")))
+
+
+def test_a_chain_goes_from_clip_to_clip_without_a_leap() -> None:
+    made = build(several(), small(chains=0))
+    chains = chained(made.reference, 3, 8.0, seed=5)
+    assert chains.length.tolist() == [241] * 3
+    way = chains.qvel[:, :2].norm(dim=-1)
+    # It stands, and it walks, no faster than its clips; no joint leaps.
+    assert way.min() < 0.2 and 1.0 < way.max() < 1.1 * made.reference.qvel[:, :2].norm(dim=-1).max()
+    assert chains.qvel[:, 6:].abs().max() < 2.0 * made.reference.qvel[:, 6:].abs().max() + 5.0
+    again = chained(made.reference, 3, 8.0, seed=5)
+    assert torch.equal(again.qpos, chains.qpos)
+    assert not torch.equal(chained(made.reference, 3, 8.0, seed=6).qpos, chains.qpos)
+
+
+def test_chains_are_learned_and_the_discriminator_is_shown_clips_alone() -> None:
+    made = build(several(), small(chains=2))
+    assert made.reference.names == ("stand", "walk", "chain-1", "chain-2")
+    learner = trainer(made, 1)
+    amp = learner.style
+    assert isinstance(amp, Amp)
+    assert amp.demos.weights().tolist() == [60.0, 60.0, 0.0, 0.0]  # type: ignore[attr-defined]
+    learner.iterate()
+    learner.close()
+    # One clip has no other to go to.
+    assert len(build(swing(2.0), small(chains=2)).reference.length) == 1
+
+
+def test_a_run_goes_on_and_is_led_by_the_hand(tmp_path: Path) -> None:
+    config = small(action="absolute", chains=1)
+    for count in (1, 2):
+        made = begin(tmp_path, several(), config)
+        done = train(made, tmp_path, Until(iterations=count), threads=1, tensorboard=False)
+        assert done.last is not None and done.last.iteration == count
+    with refused("settings-differ"):
+        begin(tmp_path, several(), small())
+    run = opened(tmp_path)
+    assert run.recipe == "compliant-imitation" and run.task.reference.names == ("stand", "walk")
+    assert run.episode("walk").rollouts.lengths.tolist() == [61]
+    played = run.play(HandInHand(lead=0.5, sway=0.0), count=2, seconds=0.5, threads=1)  # type: ignore[attr-defined]
+    assert played.figures["force_mean_n"] > 0.0 and played.figures["goal_moved_m"] > 0.0
+    assert played.stiff["goal_moved_m"] == 0.0
+    with refused("option-not-applicable"):
+        run.play(Throws())  # type: ignore[attr-defined]
+    with refused("policy-of-own-clips"):
+        _ = run.tracker
 
 
 def test_what_the_paper_states() -> None:

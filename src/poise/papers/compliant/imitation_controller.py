@@ -8,6 +8,7 @@
 | Sec. 4.2 s = s(q (-) u), two poses, u      | `two_poses`, `turns`, `displacement`     |
 | Sec. 5.1 network, PPO, noise of 6 degrees  | `CompliantImitation.paper`               |
 | Sec. 3, 5.2 compliance                     | `TaskConfig.compliance`                  |
+| Sec. 5.3 transitions among several motions | `chained`                                |
 
 Policy and discriminator both see q (-) u. Terms ask for `frame.shifted`; in frames of clips, which know
 of no displacement, that is None, and the clip's own pose is taken.
@@ -19,25 +20,34 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import BodyConfig, Humanoid
 from poise.control import Compliance, PDTargets
-from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
+from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
 from poise.env import observations as obs
 from poise.env import rewards as reward
 from poise.env.frame import Frame
 from poise.env.pushes import Pushes
 from poise.env.rewards import pose
+from poise.env.style import ClipWindows
 from poise.errors import PoiseError
-from poise.learn import AmpConfig, PPOConfig
-from poise.motion.rotations import into_heading, quat_between, quat_to_sixd
+from poise.learn import Amp, AmpConfig, PPOConfig, Trainer
+from poise.motion.rotations import (
+    heading_angle,
+    into_heading,
+    quat_between,
+    quat_to_sixd,
+    slerp,
+    turned,
+)
 from poise.papers.compliant.opponents import Shifted
 from poise.recipes.imitation import Clips, Imitation, fitted
-from poise.settings import Migration, from_data, validate
+from poise.settings import Migration, Range, from_data, validate
 from poise.sim import SimConfig
 
 
@@ -115,12 +125,15 @@ class CompliantImitation:
             these the policy also sees the reference's next angles.
         level: of compliance, alpha; None for a character that does not give way.
         newtons: between which pushes at the hands are drawn; None for none.
+        chains: goals that go from clip to clip, of which so many are learned beside several clips; the
+            discriminator knows the clips alone. See `chained`.
     """
 
     style: AmpConfig | None = field(default_factory=AmpConfig.compliant)
     action: Literal["absolute", "additive"] = "additive"
     level: float | None = 0.16
     newtons: tuple[float, float] | None = (10.0, 60.0)
+    chains: Annotated[int, Range(0)] = 8
     num_envs: int = 256
     horizon: int = 300
     seed: int = 0
@@ -138,6 +151,11 @@ class CompliantImitation:
                 "Set AmpConfig.product, as compliant() does",
                 code="settings-conflict",
             )
+
+    @property
+    def method(self) -> str:
+        """What a score card calls it."""
+        return str(RECIPE["name"])
 
     @classmethod
     def paper(cls, few: bool = True, **changes: Any) -> CompliantImitation:
@@ -199,16 +217,77 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
     )
 
 
+#: s: how long a piece of a chain is, of a clip that is as long; s in which a pose passes into the next.
+PIECE_S, PASSES_S = (1.5, 3.0), 0.3
+
+
+def chained(reference: Reference, count: int, seconds: float, seed: int = 0) -> Reference:
+    """Goals that last so many `seconds` and go from clip to clip: pieces of the clips in a drawn order,
+    each begun where the last one ended and as it was heading.
+
+    In the first `PASSES_S` of a piece the last pose passes into it, joint by joint, which no clip shows:
+    a controller that sees the root alone, as one with absolute targets does, has to find its own steps.
+    """
+    rng, rate = np.random.default_rng(seed), reference.rate_hz
+    lengths = [int(n) for n in reference.length]
+    clips = [q.numpy() for q in torch.split(reference.qpos, lengths)]
+    frames = max(3, round(seconds * rate) + 1)
+    made = [_chain(clips, frames, rate, rng) for _ in range(count)]
+    return Reference(reference.humanoid, made, rate, [f"chain-{i + 1}" for i in range(count)])
+
+
+def _chain(clips: list[np.ndarray], frames: int, rate: float, rng: np.random.Generator) -> np.ndarray:
+    out, k = np.empty((0, clips[0].shape[1])), -1
+    while len(out) < frames:
+        others = [i for i in range(len(clips)) if i != k] or [k]
+        k = others[int(rng.integers(len(others)))]
+        long = min(len(clips[k]), max(3, round(rng.uniform(*PIECE_S) * rate)))
+        first = int(rng.integers(len(clips[k]) - long + 1))
+        piece = clips[k][first : first + long].copy()
+        if len(out):
+            last, goes = out[-1], out[-1, :2] - out[-2, :2]
+            angle = heading_angle(last[3:7]) - heading_angle(piece[0, 3:7])
+            piece = turned(piece, angle, piece[0, :2], last[:2] + goes)
+            n = min(len(piece), max(1, round(PASSES_S * rate)))
+            share = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1))[:, None]
+            piece[:n, 3:7] = slerp(np.repeat(last[None, 3:7], n, 0), piece[:n, 3:7], share[:, 0])
+            for part in (slice(2, 3), slice(7, None)):
+                piece[:n, part] = last[part] + share * (piece[:n, part] - last[part])
+        out = np.concatenate((out, piece))
+    return out[:frames]
+
+
 def build(clips: Clips, config: CompliantImitation | None = None) -> Imitation:
-    """Body, reference and task of clips in any order; train with `.trainer(style=config.style)`."""
+    """Body, reference and task of clips in any order; `trainer` trains it."""
     config = config or CompliantImitation()
     library, humanoid, reference, report = fitted(clips, config.body, config.sim.control_hz)
+    if config.chains and len(library) > 1:
+        seconds = config.horizon / config.sim.control_hz
+        reference = reference.joined(chained(reference, config.chains, seconds, config.seed))
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
+
+
+def trainer(made: Imitation, threads: int = 0) -> Trainer:
+    """Trains what `build` made, by the discriminator of its settings, which is shown the clips and no
+    chains."""
+    style: AmpConfig | None = made.config.style
+    made.check(made.config.num_envs)
+    env = made.env(threads=threads)
+    if style is None:
+        return made.trainer(threads, env=env)
+    odds = (made.reference.length.cpu() - 1).double()
+    odds[len(made.library) :] = 0.0
+    demos = ClipWindows(env.clip_features, style.frames, lambda: odds)
+    return made.trainer(threads, env=env, style=Amp(env, demos, style, made.config.seed))
+
+
+#: What runs of earlier versions did, which do not name these settings.
+_MIGRATION = Migration(absent={"chains": 0})
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> CompliantImitation:
     """The settings that a run holds as JSON data."""
-    return from_data(CompliantImitation, Migration()(data), where)
+    return from_data(CompliantImitation, _MIGRATION(data), where)
 
 
 #: See `results/papers.csv`.

@@ -9,16 +9,16 @@ played.figures["force_mean_n"], played.write(Path("out"))
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from poise.control import Compliance, Stiffness
-from poise.env import ImitationEnv
+from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
 from poise.formats import write_clip
 from poise.formats.text import write_whole
@@ -151,6 +151,29 @@ class Played:
         return paths
 
 
+class Looked(NamedTuple):
+    """Episodes of one character in a scene, and what was seen of them."""
+
+    task: Imitation
+    rollouts: RolloutSet
+    watch: Watch
+    evaluation: Evaluation
+
+
+def played(scene: PlayScene, one: Looked, stiff: Looked, name: str = "") -> Played:
+    """Episodes of a character that gives way beside those of its twin that does not.
+
+    name: of the scene, by default that of its class.
+    """
+    called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
+    return Played(
+        called, {**WORDS, **words_of(scene)}, one.task, one.evaluation,
+        {k: v.numpy() for k, v in one.watch.figures(one.rollouts, one.task).items()},
+        {k: v.numpy() for k, v in stiff.watch.figures(stiff.rollouts, one.task).items()},
+        tuple(one.watch.arrows), one.watch.movers(),
+    )  # fmt: skip
+
+
 def summed(episodes: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Means over episodes, of `COUNTS` how many; 0 where no episode has a figure."""
     out = dict[str, float]()
@@ -213,7 +236,7 @@ def play(
     if isinstance(scene, Chicken) and scene.against == "rival":
         stage, rival = rival_stage(scene, tracker, stage)
         task = replace(task, props=stage.props, touches=stage.touches)
-    both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
+    both: list[Looked] = []
     if learned is not None:
         given = learned.config.played(given)
     for compliance in (stage.yields(given), None):
@@ -225,14 +248,7 @@ def play(
             own = replace(own, obs=(*own.obs, *seen(stage, top.config)))
         ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
-    (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
-    called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
-    return Played(
-        called, {**WORDS, **words_of(scene)}, imitation, evaluation,
-        {k: v.numpy() for k, v in looked.figures(rollouts, task).items()},
-        {k: v.numpy() for k, v in other.figures(others, task).items()},
-        tuple(looked.arrows), looked.movers(),
-    )  # fmt: skip
+    return played(scene, both[0], both[1], name)
 
 
 def _title(scene: str, motion: str) -> str:
@@ -247,27 +263,47 @@ def _episodes(
     threads: int,
     learned: LearnedOnTop | None = None,
     lookahead: LookaheadConfig | None = None,
-) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
-    zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
+) -> Looked:
     topped = None if learned is None else Topped(tracker.policy, learned.top, learned.added)
     ahead = look_ahead(tracker, task, lookahead, threads) if lookahead else None
+    begin = [] if topped is None else [topped.begin]
+    begin += [] if ahead is None else [ahead.watch]
+    acts = ahead or topped or tracker.policy
+    try:
+        return looked_at(scene, acts, task, count, threads, tracker.about, begin, tracker.config.method)
+    finally:
+        if ahead is not None:
+            ahead.copies.close()
+
+
+def looked_at(
+    scene: PlayScene,
+    acts: Acts,
+    task: Imitation,
+    count: int,
+    threads: int = 1,
+    about: Mapping[str, Any] | None = None,
+    begin: Sequence[Callable[[ImitationEnv], Any]] = (),
+    method: str = "",
+) -> Looked:
+    """Episodes of a task that stands in a scene, from the first frame off by `scene.starts`.
+
+    Args:
+        about: what the training of the policy took. begin: are told the environment before it acts.
+        method: what the score card calls it.
+    """
+    zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
 
     def make(worlds: int) -> ImitationEnv:
         env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
         watch.begin(env)
-        if ahead is not None:
-            ahead.watch(env)
-        if topped is not None:
-            topped.begin(env)
+        for told in begin:
+            told(env)
         return env
 
-    try:
-        rollouts, recordings = run_episodes(
-            make, ahead or topped or tracker.policy, zero, zero, cycles=1, observers=[watch],
-            trial=torch.arange(count), spread=scene.starts,
-        )  # fmt: skip
-    finally:
-        if ahead is not None:
-            ahead.copies.close()
-    card = scored(rollouts, task, tracker.about, RULE, tracker.config.method)
-    return task, rollouts, watch, Evaluation(card, rollouts, recordings, False)
+    rollouts, recordings = run_episodes(
+        make, acts, zero, zero, cycles=1, observers=[watch], trial=torch.arange(count),
+        spread=scene.starts,
+    )  # fmt: skip
+    card = scored(rollouts, task, about or {}, RULE, method)
+    return Looked(task, rollouts, watch, Evaluation(card, rollouts, recordings, False))

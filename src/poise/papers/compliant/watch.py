@@ -109,7 +109,9 @@ class Watch:
     def see(self, env: ImitationEnv, step: int) -> bool:
         """Keeps control step `step`; it never needs more of them."""
         felt = [f for f in (p.felt() for p in self._felt) if f is not None]
-        force = torch.stack([f.force.norm(dim=-1).sum(1) for f in felt]).sum(0).double()
+        force = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
+        for one in felt:
+            force = force + one.force.norm(dim=-1).sum(1).double()
         peak, metered = force, env.event(ScenePart)
         if metered is not None and "peak/hit" in metered.tells():
             # Physics step by physics step, where it is metered.
@@ -170,14 +172,15 @@ class Watch:
         return {k: v.double().cpu() for k, v in found.items()}
 
 
-def footfalls(height: Tensor) -> Tensor:
-    """`(E,)` how often feet come down, of the height of their soles `(E, T, F)` m."""
+def footfalls(height: Tensor, lifted: float = UP_M) -> Tensor:
+    """`(E,)` how often feet come down that were higher than `lifted`, of the height of their soles
+    `(E, T, F)` m."""
     up = torch.zeros_like(height[:, 0], dtype=torch.bool)
     out = torch.zeros(len(height), dtype=torch.long)
     for t in range(height.shape[1]):
         down = up & (height[:, t] < DOWN_M)
         out += down.sum(1)
-        up = (up & ~down) | (height[:, t] > UP_M)
+        up = (up & ~down) | (height[:, t] > lifted)
     return out
 
 
