@@ -972,7 +972,7 @@ def _imitations() -> tuple[Claim, ...]:
             published = "UHC with residual force" if name != "UHC" else "UHC"
             out.append(
                 Claim(
-                    f"{paper}, {name}" + (", ours on five subjects" if uhc else ""),
+                    f"{paper}, {name}" + (", ours on a dozen clips" if uhc else ""),
                     f"{_LADDER}{row}" if uhc else "",
                     "worse",
                     f"{_LADDER}relaxed",
