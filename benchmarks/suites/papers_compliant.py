@@ -182,9 +182,14 @@ def flipping(made: Imitation, act: Acts, count: int) -> dict[str, list[float]]:
     reference's root."""
     zero = torch.zeros(count, dtype=torch.long)
     rollouts, _ = run_episodes(
-        lambda n: made.env(n, None, False, 1, guard=False), act, zero, zero, cycles=1,
-        trial=torch.arange(count), spread=SPREAD,
-    )  # fmt: skip
+        lambda n: made.env(n, None, False, 1, guard=False),
+        act,
+        zero,
+        zero,
+        cycles=1,
+        trial=torch.arange(count),
+        spread=SPREAD,
+    )
     far = (rollouts.pos[:, :, 0] - rollouts.ref_pos[:, :, 0]).norm(dim=-1).mean(1)
     lost = judge(rollouts, success_rule(RULE)).failed_at >= 0
     return {"lost": lost.double().tolist(), "root_m": far.tolist()}
@@ -223,7 +228,7 @@ def samples_of(places: Places) -> int:
 
 
 def clips(places: Places, what: str) -> list[Clip]:
-    """What a unit learns."""
+    """The task that a unit learns."""
     if what == BACKFLIP:
         return [single(places, "backflip")]
     if what != PLANNER:

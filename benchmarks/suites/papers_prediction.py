@@ -587,7 +587,8 @@ class Rows:
             by = self._control(method)
             source = "EgoPose" if method == "EgoPose" else "ours"
             pasts = self._pasts(source)
-            done = simulated(self.tracker, by, pasts, self.futures(source), self._latents(pasts))
+            z = torch.empty(0) if source == "EgoPose" else self._latents(pasts)
+            done = simulated(self.tracker, by, pasts, self.futures(source), z)
             qpos = done.qpos
             about |= {
                 "body": True,

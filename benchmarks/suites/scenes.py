@@ -344,7 +344,7 @@ TOP_LEVELS, BY = ("level 0", "level 0.04", "level 0.16", "level 0.2"), ", learne
 
 @cache
 def tops(places: Places) -> dict[str, LearnedOnTop]:
-    """What runs have learned on top of the policy, by the names of their folders."""
+    """The policies that runs have learned on top, by the names of their folders."""
     home = places.work / "compliant"
     if places.smoke and not home.exists():
         net = PPOConfig(horizon=2, epochs=1, minibatch=4, policy_hidden=(8,), value_hidden=(8,))

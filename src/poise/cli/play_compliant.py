@@ -167,7 +167,7 @@ def run(
         chosen = level is not None or newtons_per_metre is not None
         if learned is None:
             knows = None if controller == "lookahead" else shipped(scene, tracker)
-            # What comes along and has learned no levels is not asked for one.
+            # A policy that comes along and has learned no levels is not asked for one.
             knows = None if chosen and knows is not None and knows.config.drawn is None else knows
         else:
             knows = None if str(learned) == "none" else open_learned(learned, tracker)

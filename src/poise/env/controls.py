@@ -58,7 +58,7 @@ class Actuation:
         self._places = torch.tensor([b + 1 for b in self.bodies], device=backend.device)
         # One for characters with help, one for those without.
         self.functions: dict[bool, TensorFunction] = {}
-        # Where targets are interpolated, those at the end of the last control step.
+        # The targets at the end of the last control step, if they are interpolated.
         self.before_targets = torch.zeros_like(backend.drive.ctrl)
 
     def apply(
@@ -216,7 +216,7 @@ class Controls:
         self.actuation.begin(age == 0)
 
     def rows(self) -> dict[str, Tensor]:
-        """What copies of worlds need `(N, ...)` beside the action."""
+        """Tensors `(N, ...)` by name that copies of worlds need beside the action."""
         return {"targets": self.actuation.before_targets} if self._task.pd.interpolate else {}
 
     def sources(self) -> dict[str, Tensor]:

@@ -192,7 +192,7 @@ class InScene:
 class ScenePart(Force):
     """A task's part in the N worlds of a scene, for its K characters in each.
 
-    Where forces are felt, terms can read "load" `(N K,)`, N: the mean size of what is metered over the
+    If forces are felt, terms can read "load" `(N K,)`, N: the mean size of what is metered over the
     last control step, or else of what is felt at its end; and "since" `(N K,)`, s since that was
     `LEAST_N` or more in this episode.
 

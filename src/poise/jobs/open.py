@@ -252,11 +252,14 @@ def _folder(folder: Path) -> Run:
     file = RunFile(path, meta, tensors)
     known = {PERPETUAL["name"]: perpetual_config, RESIDUAL_FORCE["name"]: config_of}
     if file.recipe not in known:
-        hint = "Runs of compliant-imitation are for poise play and poise eval"
+        own = file.recipe == "compliant-imitation"
+        hint = "Runs of it are for poise play and poise eval" if own else None
         raise PoiseError(
-            f"there is no recipe '{json.dumps(file.recipe)[1:-1][:40]}' here", path, hint,
+            f"there is no recipe '{json.dumps(file.recipe)[1:-1][:40]}' here",
+            path,
+            hint,
             code="unknown-recipe",
-        )  # fmt: skip
+        )
     return Run(folder, file.recipe, known[file.recipe](meta["config"], path), file)
 
 

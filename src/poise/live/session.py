@@ -344,6 +344,7 @@ class Live:
 
     def close(self) -> None:
         """Frees the simulations."""
+        self.aims.close()
         self.world.close()
 
 

@@ -173,6 +173,11 @@ class Targets:
             seed = int(self.rng.integers(2**31))
             self.endless[k] = EndlessCoords(self.generator, seed, self._executor, lambda: self._trials)
 
+    def close(self) -> None:
+        """Frees the copies."""
+        if "_trials" in self.__dict__:
+            self._trials.copies.close()
+
     @cached_property
     def _trials(self) -> FutureTrials:
         """Copies in which all characters try, one after another; made beside the loop."""

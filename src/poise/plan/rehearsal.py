@@ -86,8 +86,8 @@ class FutureTrials:
         return best._replace(frames=max(FEWEST, best.frames - SAFE))
 
     def _attempt(self, made: Tensor) -> tuple[int, int, bool]:
-        """Which of the futures `(K, f, 7 + n)` is the first that is done, else is followed for longest;
-        so many of its frames; and whether it is done to its end."""
+        """The index of the first of the futures `(K, f, 7 + n)` that is done, else of the one that is
+        followed for longest; so many of its frames; and whether it is done to its end."""
         copies, tried, every = self.copies, self.tried, self._every
         known = int(tried.count[0] - 1 - tried.at[0])
         tried.extend(every, made[every % len(made)])

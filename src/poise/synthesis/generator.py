@@ -327,7 +327,7 @@ class Kinematic:
         return torch.cat([z.unflatten(0, (len(past), -1)) for z in parts], 1).flatten(0, 1)
 
     def rows(self) -> Mapping[str, Tensor]:
-        """What worlds wish, and z; else it remembers nothing but the past that it is given."""
+        """Labels that worlds wish, and z; else it remembers nothing but the past that it is given."""
         kept = {} if self.latent is None else {"latent": self.latent}
         return kept | ({} if self.wishes is None else self.wishes.rows())
 

@@ -148,7 +148,7 @@ def test_what_learned_levels_is_played_at_each(tracker: Tracker, tmp_path: Path)
     played = play(config.play(), tracker, None, Compliance(0.05), 1, 0.5, 1, "throws", learned)
     given = played.imitation.task.compliance
     assert isinstance(given, Compliance) and given.level == 0.05 and given.drawn is None
-    # What was learned acts, at the level that is asked for.
+    # The policy on top acts, at the level that is asked for.
     found = throws(tracker, Compliance(), (0.0, 0.1), 2, threads=1, learned=learned)
     plain = throws(tracker, Compliance(), (0.0,), 2, threads=1)
     assert found.torque.shape == (2, 2) and (found.torque[:1] != plain.torque).any()

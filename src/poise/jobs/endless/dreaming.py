@@ -297,7 +297,7 @@ def trials_of(tracker: Tracker, generator: Kinematic, tries: int) -> FutureTrial
     copies = task.env(tries, None, False, 1, help_scale=0.0, guard=False)
     lead = max(*tracker.config.window, 1) + 1
     rate = tracker.config.sim.control_hz
-    # What copies begin with is replaced, and wishes are those of other worlds.
+    # The copies' own motion is replaced, and wishes are those of other worlds.
     begins = generator.wishing(0.0)
     goal = GeneratorGoal(begins, tracker.humanoid, rate, tries, lead=lead, plans=False)
     goal.reset(torch.arange(tries))

@@ -154,7 +154,7 @@ class CompliantImitation:
 
     @property
     def method(self) -> str:
-        """What a score card calls it."""
+        """Its name on a score card."""
         return str(RECIPE["name"])
 
     @classmethod
@@ -281,7 +281,7 @@ def trainer(made: Imitation, threads: int = 0) -> Trainer:
     return made.trainer(threads, env=env, style=Amp(env, demos, style, made.config.seed))
 
 
-#: What runs of earlier versions did, which do not name these settings.
+#: The settings of earlier versions' runs, which do not name them.
 _MIGRATION = Migration(absent={"chains": 0})
 
 

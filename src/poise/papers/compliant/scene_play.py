@@ -167,11 +167,15 @@ def played(scene: PlayScene, one: Looked, stiff: Looked, name: str = "") -> Play
     """
     called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
     return Played(
-        called, {**WORDS, **words_of(scene)}, one.task, one.evaluation,
+        called,
+        {**WORDS, **words_of(scene)},
+        one.task,
+        one.evaluation,
         {k: v.numpy() for k, v in one.watch.figures(one.rollouts, one.task).items()},
         {k: v.numpy() for k, v in stiff.watch.figures(stiff.rollouts, one.task).items()},
-        tuple(one.watch.arrows), one.watch.movers(),
-    )  # fmt: skip
+        tuple(one.watch.arrows),
+        one.watch.movers(),
+    )
 
 
 def summed(episodes: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -302,8 +306,14 @@ def looked_at(
         return env
 
     rollouts, recordings = run_episodes(
-        make, acts, zero, zero, cycles=1, observers=[watch], trial=torch.arange(count),
+        make,
+        acts,
+        zero,
+        zero,
+        cycles=1,
+        observers=[watch],
+        trial=torch.arange(count),
         spread=scene.starts,
-    )  # fmt: skip
+    )
     card = scored(rollouts, task, about or {}, RULE, method)
     return Looked(task, rollouts, watch, Evaluation(card, rollouts, recordings, False))

@@ -302,17 +302,21 @@ class Compliant:
         own, weight = self.players
         given = {
             "ball": {
-                "lengths": length, "masses": mass, "spread": self.tilt, "pushes": self.pushes,
+                "lengths": length,
+                "masses": mass,
+                "spread": self.tilt,
+                "pushes": self.pushes,
                 "seed": self.seed,
             },
             "door": {
-                "width": width[0], "arc": self.arc,
+                "width": width[0],
+                "arc": self.arc,
                 **({"widths": width, "made_for": width[0]} if width[0] < width[1] else {}),
             },
             "chicken": {"mass": own, "other": weight, "seed": self.seed},
             "throws": {"seed": self.seed},
             "trampoline": {"heights": _between(self.height)},
-        }  # fmt: skip
+        }
         return kind(**given.get(self.scene, {}))
 
     @property
@@ -399,12 +403,18 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
     )
 
 
-#: What runs of earlier versions did, which do not name these settings.
+#: The settings of earlier versions' runs, which do not name them.
 _MIGRATION = Migration(
     absent={
-        "arc": 0.0, "length": 1.0, "mass": 0.5, "tilt": 0.02, "spread": 0.0, "body": False, "noise": None
+        "arc": 0.0,
+        "length": 1.0,
+        "mass": 0.5,
+        "tilt": 0.02,
+        "spread": 0.0,
+        "body": False,
+        "noise": None,
     }
-)  # fmt: skip
+)
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Compliant:

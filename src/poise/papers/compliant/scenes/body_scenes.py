@@ -364,9 +364,16 @@ class TrampolineScene:
             events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
         )  # fmt: skip
         return SceneSetup(
-            (plate,), (), touches, (part,), (feels(humanoid),), (eased(humanoid, LANDED_SHARE),),
-            from_start=True, floor=Plane(BELOW_M), yields=stands_still,
-        )  # fmt: skip
+            (plate,),
+            (),
+            touches,
+            (part,),
+            (feels(humanoid),),
+            (eased(humanoid, LANDED_SHARE),),
+            from_start=True,
+            floor=Plane(BELOW_M),
+            yields=stands_still,
+        )
 
 
 def stands_still(given: Given | None) -> Given:

@@ -225,7 +225,7 @@ class Grip(SceneEvent):
         knob = torch.tensor(self.door.knob).to(sim.backend.device)
         self._knob = knob.expand(sim.num_envs, 3)
         if self.varied:
-            # Where the weld's hook is on each world's leaf.
+            # The place of the weld's hook on each world's leaf.
             hook = sim.scene.model.site(links[self._row].hook).id
             self._knob = sim.backend.expand("site_pos")[:, hook]
         self.steps = torch.zeros(sim.num_envs, dtype=torch.long, device=sim.backend.device)
