@@ -328,7 +328,7 @@ def control(
         return replace(made, events=(), **seen)
 
     def make(reference: Reference, z: Tensor) -> Imitation:
-        return _imitation(tracker, reference, config, own(z))
+        return _imitation(tracker, reference, config, own(z[:, None]))
 
     if isinstance(learned, list):
         names = [f"motion {k}" for k in range(len(learned))]

@@ -24,6 +24,7 @@ from poise.papers.compliant.imitation_controller import CompliantImitation
 from poise.papers.compliant.scene_training import Compliant
 from poise.papers.perpetual.ablations import StagedPerpetual
 from poise.papers.perpetual.trajopt import TrajOptConfig
+from poise.papers.residual_force.dual_policy import DualPolicy
 from poise.recipes import ResidualForce
 from poise.settings import imported
 from refusals import refused
@@ -35,6 +36,7 @@ KINDS: dict[str, Any] = {
     "endless": Endless,
     "compliant": Compliant,
     "compliant-imitation": CompliantImitation,
+    "dual-policy": DualPolicy,
 }
 
 

@@ -45,7 +45,7 @@ def run(
                 code="wrong-suffix",
             )
         may_write(rollouts, force)
-    from poise.papers.compliant.controller_run import opened as open_run
+    from poise.papers.opened import opened as open_run
 
     opened, outputs = open_run(run), {}
     with working("simulating every start frame"):

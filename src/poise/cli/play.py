@@ -38,7 +38,7 @@ def run(
     if out is not None:
         may_write(out, force)
     from poise.jobs.deliver import make_report
-    from poise.papers.compliant.controller_run import opened as open_run
+    from poise.papers.opened import opened as open_run
     from poise.score.report import write_report
 
     with working("simulating"):

@@ -205,7 +205,8 @@ def told(played: Played, out: Path, given: Compliance | Stiffness | None, open: 
 def controller_in(learned: Path) -> ControllerRun | None:
     """The run of the imitation controller that a folder holds; None where it holds none."""
     from poise.jobs.run_file import RUN_FILE
-    from poise.papers.compliant.controller_run import ControllerRun, opened
+    from poise.papers.compliant.controller_run import ControllerRun
+    from poise.papers.opened import opened
 
     run = opened(learned) if (learned / RUN_FILE).exists() else None
     return run if isinstance(run, ControllerRun) else None

@@ -42,6 +42,7 @@ SOURCES = {
     "endless": "poise.jobs.endless.endless_training:Endless",
     "compliant": "poise.papers.compliant.scene_training:Compliant",
     "compliant-imitation": "poise.papers.compliant.imitation_controller:CompliantImitation",
+    "dual-policy": "poise.papers.residual_force.dual_policy:DualPolicy",
 }
 #: The dataclass of how a motion is tracked.
 TRACK = "poise.jobs.track_settings:TrackConfig"

@@ -38,13 +38,14 @@ class Options:
     """Train a recipe on one clip, on several clips of one skeleton or on a folder, and no more."""
 
     recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
-    """residual-force, inbetween, perpetual, endless, compliant, or compliant-imitation."""
+    """residual-force, inbetween, perpetual, endless, dual-policy, compliant, or compliant-imitation."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
-    """Motion files. compliant: the scene: ball, door, throws, hands, trampoline, chicken."""
+    """Motion files. compliant: the scene: ball, door, throws, hands, trampoline, chicken. dual-policy:
+    the kinematic policy that it follows, by default that of Poise."""
     json: Json = False
     training: OmitArgPrefixes[Training] = Training()
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
@@ -73,6 +74,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         from poise.cli.train_compliant import run as compliant
 
         return compliant(config, o.out, o.training, again)
+    if o.recipe == "dual-policy":
+        from poise.cli.train_endless import control
+
+        return control(config, o.clips, o.out, o.training, o.primitives.going_on, again)
     if o.recipe not in ("residual-force", "compliant-imitation"):
         _only_a_folder(o)
         from poise.cli.train_endless import run as endless
@@ -127,11 +132,12 @@ def config_of(o: Options) -> Any:
     """The recipe's settings, as the command line states them; what belongs to another one is refused."""
     values = given(o.recipe_settings, o.network, o.primitives)
     default = imported(SOURCES[o.recipe])()
-    known = {f.name for f in fields(default)}
+    known = {f.name for f in fields(default)} - ({"body"} if o.recipe == "dual-policy" else set[str]())
     own = {
         "inbetween": ("dropout",),
         "perpetual": BY_HAND,
         "endless": ("going_on",),
+        "dual-policy": ("going_on", "set"),
         "compliant": ("set",),
     }.get(o.recipe, ())
     for name in [*values, *(given(o.body) if "body" not in known else ())]:
@@ -144,7 +150,7 @@ def config_of(o: Options) -> Any:
             )
     if o.recipe == "perpetual":
         return settings(o.primitives, o.training, o.body, values)
-    if o.recipe == "endless":
+    if o.recipe in ("endless", "dual-policy"):
         values.pop("going_on", None)
     if o.recipe == "compliant" and o.clips:
         scene, *more = map(str, o.clips)
@@ -154,7 +160,7 @@ def config_of(o: Options) -> Any:
     if "dropout" in values:
         values["between_training.dropout"] = values.pop("dropout")
     t, clip = o.training, None
-    if t.by_clip and o.clips and o.recipe != "compliant":
+    if t.by_clip and o.clips and o.recipe not in ("compliant", "dual-policy"):
         clip = o.reading.read(o.clips[0])
     return t.settings(o.recipe, default, o.body, values, clip)
 

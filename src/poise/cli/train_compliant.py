@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 from poise.cli.console import Answer, notes
 from poise.cli.options import clips_in
-from poise.cli.training import finished, refuse_held, working
+from poise.cli.training import finished, on_the_cpu, refuse_held, working
 from poise.cli.training import stopped as interrupted
 from poise.cli.training import training as progress
-from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
     from poise.learn import LATEST, Until
     from poise.papers.compliant.scene_training import RUN_FILE, train
 
-    _on_the_cpu("compliant", training)
+    on_the_cpu("compliant", training)
     refuse_held(out, RUN_FILE, training)
     with working("opening the policy"):
         tracker = open_run(config.policy or None).tracker
@@ -55,7 +54,7 @@ def controller(
     from poise.motion import ClipLibrary
     from poise.papers.compliant.controller_run import begin, train
 
-    _on_the_cpu("compliant-imitation", training)
+    on_the_cpu("compliant-imitation", training)
     refuse_held(out, RUN_FILE, training)
     library = ClipLibrary(tuple(reading.read(f).replaced(name=n) for n, f in clips_in(clips, out)))
     until = Until(minutes=training.minutes, iterations=training.iterations)
@@ -70,12 +69,3 @@ def controller(
     then = f"poise play {out} shows it; poise play compliant hands --learned {out} -o OUT leads its hand"
     told = finished(out, result.last, "limit", "samples", then)
     return Answer(told, {"run": out, "checkpoint": out / LATEST})
-
-
-def _on_the_cpu(recipe: str, training: Training) -> None:
-    if training.device != "cpu":
-        raise PoiseError(
-            f"the recipe {recipe} trains on the CPU",
-            hint="Leave --device out",
-            code="option-not-applicable",
-        )

@@ -1,15 +1,18 @@
-"""`poise train endless`: a kinematic policy for `poise dream` from a folder of clips."""
+"""`poise train endless`: a kinematic policy for `poise dream` from a folder of clips; and `poise train
+dual-policy`: a control policy that follows one."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli.console import Answer, say, tell
 from poise.cli.library_options import Library
 from poise.cli.train_inbetween import times
-from poise.cli.training import finished, refuse_held, showing
+from poise.cli.training import finished, on_the_cpu, refuse_held, showing, working
 from poise.cli.training import stopped as interrupted
+from poise.cli.training import training as progress
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 from poise.machine import cores
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from poise.cli.options import Training
     from poise.jobs.endless.endless_training import Endless
     from poise.learn.inbetween_model import BlockStats
+    from poise.papers.residual_force.dual_policy import DualPolicy
 
 
 def run(
@@ -66,6 +70,46 @@ def run(
     then = f"poise dream --generator {out} -o OUT lets a character go about by it"
     result = finished(out, stats, "last step", "windows", then)
     return Answer(result, {"run": out, "generator": out / GENERATOR})
+
+
+def control(
+    config: DualPolicy,
+    generator: Sequence[Path],
+    out: Path,
+    training: Training,
+    policy: Path | None,
+    again: str,
+) -> Answer:
+    """Trains the control policy of a kinematic policy until the limit or Ctrl-C.
+
+    generator: its run or its file; none is that of Poise. policy: whose body it moves; by default that
+    of Poise.
+    """
+    from poise.jobs.endless.model import load_generator
+    from poise.jobs.open import open_run
+    from poise.jobs.run_file import RUN_FILE
+    from poise.jobs.runs import train
+    from poise.learn import LATEST
+    from poise.papers.residual_force.dual_run import begin
+
+    if len(generator) > 1:
+        raise PoiseError(
+            f"one kinematic policy is followed at a time, got {len(generator)}", code="over-limit"
+        )
+    on_the_cpu("dual-policy", training)
+    refuse_held(out, RUN_FILE, training)
+    with working("opening the policies"):
+        model = load_generator(generator[0] if generator else None)
+        tracker = open_run(policy).tracker
+    until = training.until()
+    with claimed(out):
+        made = begin(out, model, tracker, config)
+        with progress(until) as show:
+            result = train(made, out, until, show, training.threads)
+    if result.interrupted:
+        return interrupted(out, again)
+    told = finished(out, result.last, "limit", "samples", f"poise play {out} shows it")
+    return Answer(told, {"run": out, "checkpoint": out / LATEST})
 
 
 def figures(stats: BlockStats) -> str:

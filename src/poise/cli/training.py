@@ -151,6 +151,16 @@ def refuse_held(out: Path, run_file: str, training: Training) -> None:
         raise held_already(out)
 
 
+def on_the_cpu(recipe: str, training: Training) -> None:
+    """Refuses another device for a recipe that has none."""
+    if training.device != "cpu":
+        raise PoiseError(
+            f"the recipe {recipe} trains on the CPU",
+            hint="Leave --device out",
+            code="option-not-applicable",
+        )
+
+
 class Trained(Protocol):
     """The last lines of a training."""
 

@@ -252,7 +252,7 @@ def _folder(folder: Path) -> Run:
     file = RunFile(path, meta, tensors)
     known = {PERPETUAL["name"]: perpetual_config, RESIDUAL_FORCE["name"]: config_of}
     if file.recipe not in known:
-        own = file.recipe == "compliant-imitation"
+        own = file.recipe in ("compliant-imitation", "dual-policy")
         hint = "Runs of it are for poise play and poise eval" if own else None
         raise PoiseError(
             f"there is no recipe '{json.dumps(file.recipe)[1:-1][:40]}' here",

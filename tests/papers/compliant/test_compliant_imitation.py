@@ -17,7 +17,7 @@ from poise.learn.amp import mixed_reward
 from poise.motion import ClipLibrary
 from poise.motion.rotations import into_heading
 from poise.papers.compliant import imitation_controller as compliant
-from poise.papers.compliant.controller_run import begin, opened, train
+from poise.papers.compliant.controller_run import begin, train
 from poise.papers.compliant.imitation_controller import (
     CompliantImitation,
     build,
@@ -26,6 +26,7 @@ from poise.papers.compliant.imitation_controller import (
     trainer,
 )
 from poise.papers.compliant.scenes.body_scenes import HandInHand, Throws
+from poise.papers.opened import opened
 from poise.recipes.imitation import Imitation
 from poise.settings import to_data
 from refusals import refused

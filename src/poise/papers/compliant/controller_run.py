@@ -1,4 +1,4 @@
-"""Runs of the imitation controller: begun, trained, opened, and played in scenes (Secs. 4, 5.3).
+"""Runs of the imitation controller: begun, trained, and played in scenes (Secs. 4, 5.3).
 
 run = opened("run")                      # what poise train compliant-imitation wrote
 run.play(HandInHand(lead=0.5)).write(Path("out"))
@@ -20,8 +20,8 @@ from poise.control import Compliance
 from poise.env import Acts, Reference
 from poise.env.pushes import Pushes
 from poise.errors import PoiseError
-from poise.jobs.open import Run, open_run
-from poise.jobs.run_file import RUN_FILE, body_facts, held_run, policy_for, read_run, write_run
+from poise.jobs.open import Run
+from poise.jobs.run_file import RUN_FILE, RunFile, body_facts, held_run, policy_for, write_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics import qpos_to_clip
 from poise.learn import IterationStats, PolicyBundle, RunResult, Until, run
@@ -74,6 +74,11 @@ def train(
 
 class ControllerRun(Run):
     """A run of the imitation controller: `Run`, whose policy knows its own clips alone."""
+
+    @classmethod
+    def of(cls, file: RunFile) -> ControllerRun:
+        """The run of a run file."""
+        return cls(file.path.parent, file.recipe, config_of(file.meta["config"], file.path), file)
 
     @cached_property
     def task(self) -> Imitation:
@@ -129,16 +134,6 @@ class ControllerRun(Run):
             staged(self.task, scene, policy, seconds, x, count, threads, said) for x in (given, None)
         ]
         return played(scene, both[0], both[1], name)
-
-
-def opened(path: Path) -> Run:
-    """`open_run`, which knows the imitation controller's runs as well."""
-    if path.is_dir() and any((path / n / RUN_FILE).exists() for n in (".", "run")):
-        file = read_run(path)
-        if file.recipe == RECIPE["name"]:
-            config = config_of(file.meta["config"], file.path)
-            return ControllerRun(file.path.parent, file.recipe, config, file)
-    return open_run(path)
 
 
 def still(made: Imitation, seconds: float) -> Imitation:

@@ -4,7 +4,9 @@ Every episode begins with a past of the library (lines 6 and 7), which the kinem
 n fresh segments, each from its own frames and with a z of its own (lines 8 to 12). The policy's state is
 (x_{t-1}, x^_{t-1}, z) (line 13), its reward that of imitation with the price of the residual force.
 
-task = build(kinematic, humanoid)
+    poise train dual-policy GENERATOR -o RUN
+
+task = build(kinematic, humanoid, example)
 trainer = task.trainer()
 """
 
@@ -18,10 +20,11 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env import ObsTerm, Reference, TaskConfig
+from poise.env.controls import Drive
 from poise.env.events import Event
 from poise.env.frame import Frame, TermFunction
 from poise.env.generator_goal import GeneratorGoal
-from poise.env.goal import Goal
+from poise.env.goal import ClipGoal, Goal
 from poise.motion import Clip, ClipLibrary
 from poise.recipes import residual_force
 from poise.recipes.imitation import Imitation
@@ -58,6 +61,31 @@ class Latent(Event):
         return {"latent": self.z}
 
 
+class KnownLatent(Latent):
+    """The same of clips whose segments are known beforehand.
+
+    Args:
+        goal: follows the clips. known: `(C, K, Z)`, z of each one's segments. segment: frames of one.
+    """
+
+    def __init__(self, goal: ClipGoal, known: Tensor, segment: int):
+        super().__init__(known[goal.clip, 0].clone())
+        self.goal, self.known, self.segment = goal, known, segment
+
+    def look(self, ids: Tensor | None) -> None:
+        self._tell(self.goal.frame)
+
+    def before_step(self, drive: Drive) -> bool:
+        # Observations of the step are those of the next frame.
+        self._tell(self.goal.frame + 1)
+        return False
+
+    def _tell(self, frame: Tensor) -> None:
+        # A clip begins with the past's last frame, after which segments come.
+        now = (frame // self.segment).clamp_max(self.known.shape[1] - 1)
+        self.z.copy_(self.known[self.goal.clip, now])
+
+
 def latent(frame: Frame) -> Tensor:
     """z `(N, Z)` of the segment that each world follows."""
     return frame.source("latent")
@@ -75,13 +103,13 @@ def dual_task(
 
     Args:
         segment: f, control steps of one.
-        z: `(N, Z)` that worlds see, where what they follow is known beforehand; by default that of the
-            generator of their goal.
+        z: `(C, K, Z)` of the segments of clips, where those are followed; by default that of the
+            generator of the worlds' goal.
     """
 
     def told(goal: Goal, backend: Backend) -> Event:
         if z is not None:
-            return Latent(z)
+            return KnownLatent(goal.clips, z, segment)
         assert isinstance(goal, GeneratorGoal) and isinstance(goal.generator, Kinematic)
         assert goal.generator.latent is not None
         return Latent(goal.generator.latent)
