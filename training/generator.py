@@ -2,8 +2,9 @@
 
     python training/generator.py --library FOLDER -o RUN [--steps 6000] [--minutes M]
 
-FOLDER is that of `training/README.md`. Whole subjects of CMU are held out. The library is read once,
-into the run's folder. Resumable; the same number of steps makes the same weights.
+FOLDER is that of `training/README.md`, with what `looped.py` makes of its runs. Whole subjects of CMU are
+held out. The library is read once, into the run's folder. Resumable; the same number of steps makes the
+same weights.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ from poise.jobs.endless.model import read_labels
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.learn.inbetween_model import BlockStats
+
+
+#: Exercises on one spot, which would be a third of the library, and takes at other speeds.
+LEFT_OUT = (r"cmu_amc-29-", r"49_(09|1\d|2\d)", r"127_0[12]", "retimed")
 
 
 def shown(stats: BlockStats) -> None:
@@ -45,7 +50,8 @@ def main() -> None:
     parser.add_argument("--lr", type=float, default=1e-3)
     parser.add_argument("--held", type=float, default=0.3)
     parser.add_argument("--batch", type=int, default=128)
-    parser.add_argument("--balance", type=float, default=0.0)
+    parser.add_argument("--balance", type=float, default=0.7)
+    parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")
     parser.add_argument("--shorter", action="store_true")
     parser.add_argument("--minutes", type=float)
     parser.add_argument("--seed", type=int, default=0)
@@ -58,8 +64,8 @@ def main() -> None:
         args.library,
         open_run(None).tracker,
         settings(args),
-        hold_out=HELD_OUT,
-        leave_out=TWINS,
+        hold_out=args.hold_out,
+        leave_out=(*TWINS, *LEFT_OUT),
         reading=LibraryConfig(rates=SIXTY, mirror=True),
         tell=print,
     )

@@ -73,7 +73,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.recipe == "compliant":
         from poise.cli.train_compliant import run as compliant
 
-        return compliant(config, o.out, o.training, again)
+        return compliant(config, o.out, o.training, o.primitives.going_on, again)
     if o.recipe == "dual-policy":
         from poise.cli.train_endless import control
 
@@ -138,7 +138,7 @@ def config_of(o: Options) -> Any:
         "perpetual": BY_HAND,
         "endless": ("going_on",),
         "dual-policy": ("going_on", "set"),
-        "compliant": ("set",),
+        "compliant": ("going_on", "set"),
     }.get(o.recipe, ())
     for name in [*values, *(given(o.body) if "body" not in known else ())]:
         if name not in known and name not in own:
@@ -150,7 +150,7 @@ def config_of(o: Options) -> Any:
             )
     if o.recipe == "perpetual":
         return settings(o.primitives, o.training, o.body, values)
-    if o.recipe in ("endless", "dual-policy"):
+    if o.recipe in ("endless", "dual-policy", "compliant"):
         values.pop("going_on", None)
     if o.recipe == "compliant" and o.clips:
         scene, *more = map(str, o.clips)

@@ -20,19 +20,20 @@ if TYPE_CHECKING:
     from poise.papers.compliant.scene_training import Compliant
 
 
-def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
-    """Trains until the limit or Ctrl-C."""
+def run(config: Compliant, out: Path, training: Training, earlier: Path | None, again: str) -> Answer:
+    """Trains until the limit or Ctrl-C; a new run goes on from what was learned `earlier`."""
     from poise.jobs.open import open_run
     from poise.learn import LATEST, Until
-    from poise.papers.compliant.scene_training import RUN_FILE, train
+    from poise.papers.compliant.scene_training import RUN_FILE, open_learned, train
 
     on_the_cpu("compliant", training)
     refuse_held(out, RUN_FILE, training)
     with working("opening the policy"):
         tracker = open_run(config.policy or None).tracker
+        first = None if earlier is None else open_learned(earlier, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     with claimed(out), progress(until) as show:
-        result = train(config, tracker, out, until, show, training.threads)
+        result = train(config, tracker, out, until, show, training.threads, earlier=first)
     if result.interrupted:
         return interrupted(out, again)
     then = f"poise play compliant {config.scene} --learned {out} -o OUT shows it"

@@ -143,7 +143,8 @@ class Primitives(_Derived):
     going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
     """perpetual: go on from a trained policy, a file or a run, with its networks and body and, but for
     what --set states, its settings; with recovery it stays as it is, beside a primitive that recovers
-    or, where it can already, others that learn what it fails (--single: one network)."""
+    or, where it can already, others that learn what it fails (--single: one network). compliant: from
+    what was learned of the scene on another policy. endless, dual-policy: the policy with the body."""
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""

@@ -100,6 +100,20 @@ def test_a_tiny_training_goes_on_and_is_played(tracker: Tracker, tmp_path: Path)
         train(replace(TINY, seed=1), tracker, tmp_path / "a", Until(iterations=3), threads=1)
     with refused("not-a-run"):
         open_learned(tmp_path, tracker)
+    # A new run goes on from it, unless it sees something else.
+    slow = replace(TINY, ppo=replace(TINY.ppo, policy_lr=1e-9))
+    train(slow, tracker, tmp_path / "c", Until(iterations=1), threads=1, earlier=learned)
+    kept = open_learned(tmp_path / "c", tracker).top
+    torch.testing.assert_close(kept.act(seen), learned.top.act(seen), atol=0.05, rtol=0.05)
+    with refused("policy-unfit"):
+        train(
+            replace(TINY, body=True, reach=0.2),
+            tracker,
+            tmp_path / "d",
+            Until(iterations=1),
+            earlier=learned,
+        )
+    assert not (tmp_path / "d").exists()
 
 
 def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:

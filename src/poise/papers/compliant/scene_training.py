@@ -58,6 +58,7 @@ from poise.learn import (
     Trainer,
     Until,
     VecEnv,
+    WarmStart,
     load_policy,
     run,
 )
@@ -509,16 +510,33 @@ def train(
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     threads: int = 0,
     tensorboard: bool = True,
+    earlier: LearnedOnTop | None = None,
 ) -> RunResult:
-    """Trains until a limit; goes on where a run of the folder stopped."""
+    """Trains until a limit; goes on where a run of the folder stopped, and a new one from what was
+    learned `earlier`, on a policy that another one has replaced.
+
+    Raises:
+        PoiseError: the folder holds a run with other settings, or what was learned earlier sees or does
+            something else.
+    """
     task = scene_task(config, tracker)
-    begin(folder, config)
     env = task.env(config.num_envs, config.seed, threads=threads, help_scale=0.0, guard=False)
-    added = config.added(tracker.policy.num_obs)
+    on_top = OnTop(env, tracker.policy, config.added(tracker.policy.num_obs))
+    sizes = on_top.num_obs, on_top.num_actions
+    if earlier is not None and (earlier.top.num_obs, earlier.top.num_actions) != sizes:
+        on_top.close()
+        raise PoiseError(
+            f"what was learned of {earlier.config.scene} sees or does other things than it would here",
+            folder,
+            "State the settings by which it was learned",
+            code="policy-unfit",
+        )
+    begin(folder, config)
     with only_writer(folder):
         trainer = Trainer(
-            cast(VecEnv, OnTop(env, tracker.policy, added)), config.learner(env.hinges), config.seed,
+            cast(VecEnv, on_top), config.learner(env.hinges), config.seed,
             task.humanoid.identity, {"recipe": "compliant"}, update_threads=threads or cores(),
+            warm_start=None if earlier is None else WarmStart(earlier.top),
         )  # fmt: skip
         try:
             return run(trainer, until, folder, 10, on_iteration, tensorboard, config.cooling)
