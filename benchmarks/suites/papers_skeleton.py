@@ -322,11 +322,14 @@ def units(places: Places) -> list[str]:
     if places.smoke:
         return [f"5 frames; {k}, seed 0" for k in ("full", "full, without the floor", ONWARD)]
     out = [f"{n} frames; {LOOKS}" for n in LENGTHS]
-    out += [f"{n} frames; {v}, seed {s}" for s in SEEDS for v in (ONWARD, "full") for n in LENGTHS]
     table_4 = [v for v in VARIANTS if v not in ("full", "full to zero")]
-    out += [f"{LENGTHS[-1]} frames; {v}, seed {s}" for s in SEEDS for v in table_4]
     once = ["full to zero", *(v for v in WITHOUT if v != "full")]
-    return out + [f"{LENGTHS[-1]} frames; {v}, seed {SEEDS[0]}" for v in once]
+    for s in SEEDS:
+        out += [f"{n} frames; {v}, seed {s}" for v in (ONWARD, "full") for n in LENGTHS]
+        out += [
+            f"{LENGTHS[-1]} frames; {v}, seed {s}" for v in (*table_4, *(once if s == SEEDS[0] else ()))
+        ]
+    return out
 
 
 def corrected(places: Places, unit: str) -> Any:
