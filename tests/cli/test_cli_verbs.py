@@ -158,6 +158,7 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     from poise.jobs.inbetween import inbetween_training as inbetween
     from poise.metrics.tracking_errors import RULES
     from poise.papers.compliant import imitation_controller, scene_training
+    from poise.papers.residual_force import dual_run
     from poise.recipes import RECIPE, perpetual
 
     assert get_args(options.Rule) == tuple(RULES)
@@ -168,6 +169,7 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
         "endless",
         scene_training.RECIPE["name"],
         imitation_controller.RECIPE["name"],
+        dual_run.NAME,
     ) == RECIPES
 
 
