@@ -538,6 +538,22 @@ _S2H_IK = PaperTable(
     ),
     _SKELETON,
 )
+_WAYS = "papers:Skeleton2Humanoid, ways between clips; "
+_S2H_WAYS = PaperTable(
+    (
+        share("done", "done"),
+        Measure("s", "way_s", "1", -1),
+        Measure("jerk, m/s³", "way_jerk_m_per_s3", "0", -1),
+    ),
+    (
+        Claim(
+            "by the network (ours alone)", f"{_WAYS}the network", "better", f"{_WAYS}planned", "planned"
+        ),
+        Claim("planned (ours alone)", f"{_WAYS}planned"),
+    ),
+    f"{_PAPERS} skeleton-ways",
+    printed="no row",
+)
 _ITERATIONS = ("baseline", *(f"iteration {k}" for k in range(1, 8)))
 _ADAPTATION = "papers:Skeleton2Humanoid, adaptation; "
 _ITERATED = f"{_PAPERS} skeleton-iterations"
@@ -1186,6 +1202,7 @@ PAPER_TABLES: dict[str, PaperTable] = {
     "s2h-table-2": _S2H_2,
     "s2h-table-3": _S2H_3,
     "s2h-ik": _S2H_IK,
+    "s2h-ways": _S2H_WAYS,
     "s2h-table-4": _S2H_4,
     "s2h-table-5": _S2H_5,
     "s2h-table-6": _S2H_6,

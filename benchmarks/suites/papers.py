@@ -13,12 +13,14 @@ from benchmarks.suites import (
     papers_prediction,
     papers_residual,
     papers_skeleton,
+    papers_ways,
 )
 
 PARTS = (
     papers_residual.PARTS
     | papers_prediction.PARTS
     | papers_skeleton.PARTS
+    | papers_ways.PARTS
     | papers_perpetual.PARTS
     | papers_compliant.PARTS
 )
