@@ -87,7 +87,7 @@ def _shortened(line: str) -> list[str]:
         argv += ["--seconds", "3" if "--record" in argv else "0.4", "--port", "0"]
     if argv[0] == "open":
         argv += ["--seconds", "0.5", "--port", "0", "--no-browser"]
-    if argv[:2] == ["train", "compliant"]:
+    if argv[:2] in (["train", "compliant"], ["train", "dual-policy"]):
         argv += ["--iterations", "1", "--envs", "8", "--ppo.horizon", "4", "--threads", "1"]
     if argv[:2] == ["train", "endless"]:
         argv += ["--iterations", "2", "--threads", "1", "--config", "endless.toml"]
