@@ -2,9 +2,9 @@
 
     python training/generator.py --library FOLDER -o RUN [--steps 6000] [--minutes M]
 
-FOLDER is that of `training/README.md`, with what `looped.py` makes of its runs. Whole subjects of CMU are
-held out. The library is read once, into the run's folder. Resumable; the same number of steps makes the
-same weights.
+FOLDER is that of `training/README.md`, with what `looped.py` makes of its runs. Whole subjects of CMU
+are held out. The library is read once, into the run's folder. Resumable; the same number of steps makes
+the same weights.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from poise.jobs.endless.model import read_labels
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.learn.inbetween_model import BlockStats
-
 
 #: Exercises on one spot, which would be a third of the library, and takes at other speeds.
 LEFT_OUT = (r"cmu_amc-29-", r"49_(09|1\d|2\d)", r"127_0[12]", "retimed")
