@@ -22,6 +22,7 @@ from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.result import TRACKED
 from poise.jobs.track import track
 from poise.kinematics.travel import moved_by
+from poise.metrics import jerk
 from poise.motion import Clip, resample, trim
 from poise.motion.rotations import heading_angle
 from poise.score.gaps import BANDAI
@@ -57,10 +58,9 @@ def pair_of(places: Places, unit: str) -> tuple[Clip, Clip, float]:
     return first, moved_by(then, shift, np.zeros(then.frames)).replaced(name="then"), away
 
 
-def jerk(clip: Clip, first: int, last: int) -> float:
+def way_jerk(clip: Clip, first: int, last: int) -> float:
     """m/s^3 of the joints, the mean over frames `first` to `last`."""
-    pos = clip.positions()[max(0, first - 2) : last + 2]
-    return float(np.linalg.norm(np.diff(pos, n=3, axis=0), axis=-1).mean() * clip.fps**3)
+    return float(jerk(clip.positions()[max(0, first - 2) : last + 2], clip.fps).mean())
 
 
 def measured(places: Places, unit: str) -> Any:
@@ -81,10 +81,10 @@ def measured(places: Places, unit: str) -> Any:
         "planned": {"done": all(p.done for p in two.parts), "way_s": two.parts[1].after},
     }
     if one.motion().frames > keys[1]:
-        out["network"]["jerk"] = jerk(one.motion(), *keys)
+        out["network"]["jerk"] = way_jerk(one.motion(), *keys)
     if came:
         assert ends is not None and begins is not None
-        out["planned"]["jerk"] = jerk(made, round(ends * made.fps), round(begins * made.fps))
+        out["planned"]["jerk"] = way_jerk(made, round(ends * made.fps), round(begins * made.fps))
     return out
 
 

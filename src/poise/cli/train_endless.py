@@ -82,8 +82,8 @@ def control(
 ) -> Answer:
     """Trains the control policy of a kinematic policy until the limit or Ctrl-C.
 
-    generator: its run or its file; none is that of Poise. policy: whose body it moves; by default that
-    of Poise.
+    generator: its run or its file; none is that of the run that goes on, else that of Poise. policy:
+    whose body it moves; by default that of Poise.
     """
     from poise.jobs.endless.model import load_generator
     from poise.jobs.open import open_run
@@ -99,7 +99,7 @@ def control(
     on_the_cpu("dual-policy", training)
     refuse_held(out, RUN_FILE, training)
     with working("opening the policies"):
-        model = load_generator(generator[0] if generator else None)
+        model = load_generator(generator[0]) if generator else None
         tracker = open_run(policy).tracker
     until = training.until()
     with claimed(out):

@@ -11,10 +11,16 @@ from poise.jobs.open import Run, open_run
 from poise.jobs.run_file import RUN_FILE, read_run
 from poise.settings import imported
 
-#: The classes of runs that the engine does not know, by their recipes.
+#: The classes of runs that the engine does not know, and what reads their settings, by their recipes.
 KINDS = {
-    "compliant-imitation": "poise.papers.compliant.controller_run:ControllerRun",
-    "dual-policy": "poise.papers.residual_force.dual_run:DualRun",
+    "compliant-imitation": (
+        "poise.papers.compliant.controller_run:ControllerRun",
+        "poise.papers.compliant.imitation_controller:config_of",
+    ),
+    "dual-policy": (
+        "poise.papers.residual_force.dual_run:DualRun",
+        "poise.papers.residual_force.dual_run:config_of",
+    ),
 }
 
 
@@ -22,6 +28,8 @@ def opened(path: Path) -> Run:
     """`open_run`, which knows runs of the papers' recipes as well."""
     if path.is_dir() and any((path / n / RUN_FILE).exists() for n in (".", "run")):
         file = read_run(path)
-        if kind := KINDS.get(file.recipe):
-            return imported(kind).of(file)
+        if file.recipe in KINDS:
+            kind, config_of = map(imported, KINDS[file.recipe])
+            config = config_of(file.meta["config"], file.path)
+            return kind(file.path.parent, file.recipe, config, file)
     return open_run(path)

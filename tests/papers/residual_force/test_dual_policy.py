@@ -79,6 +79,11 @@ def test_a_run_goes_on_and_is_played(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main([*train, "--iterations", "2", "--resume"]) == 0
     assert main([*train, "--help-limit", "50", "--resume"]) == 2
     assert "other settings (help_limit)" in capsys.readouterr().err
+    other = tmp_path / "other.safetensors"
+    made = load_generator(None)
+    replace(made, about={**made.about, "seed": 9}).save(other)
+    assert main(["train", "dual-policy", str(other), *train[2:], "--resume"]) == 2
+    assert "another kinematic policy" in capsys.readouterr().err
     page = tmp_path / "play.html"
     assert main(["play", str(run), "-o", str(page), "--clip", "motion 2"]) == 0 and page.exists()
     opened_run = opened(run)

@@ -21,7 +21,7 @@ from poise.env import Acts, Reference
 from poise.env.pushes import Pushes
 from poise.errors import PoiseError
 from poise.jobs.open import Run
-from poise.jobs.run_file import RUN_FILE, RunFile, body_facts, held_run, policy_for, write_run
+from poise.jobs.run_file import RUN_FILE, body_facts, held_run, policy_for, write_run
 from poise.jobs.tracker import Tracker
 from poise.kinematics import qpos_to_clip
 from poise.learn import IterationStats, PolicyBundle, RunResult, Until, run
@@ -74,11 +74,6 @@ def train(
 
 class ControllerRun(Run):
     """A run of the imitation controller: `Run`, whose policy knows its own clips alone."""
-
-    @classmethod
-    def of(cls, file: RunFile) -> ControllerRun:
-        """The run of a run file."""
-        return cls(file.path.parent, file.recipe, config_of(file.meta["config"], file.path), file)
 
     @cached_property
     def task(self) -> Imitation:

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env import ObsTerm, Reference, TaskConfig
-from poise.env.controls import Drive
 from poise.env.events import Event
 from poise.env.frame import Frame, TermFunction
 from poise.env.generator_goal import GeneratorGoal
@@ -30,7 +29,7 @@ from poise.recipes import residual_force
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force_settings import ResidualForce
 from poise.settings import Count
-from poise.sim import Backend
+from poise.sim import Backend, Drive
 from poise.synthesis.generator import Kinematic
 
 

@@ -42,13 +42,27 @@ def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> DualP
     return from_data(DualPolicy, data, where)
 
 
-def begin(folder: Path, model: GeneratorModel, tracker: Tracker, config: DualPolicy) -> Imitation:
+def begin(folder: Path, model: GeneratorModel | None, tracker: Tracker, config: DualPolicy) -> Imitation:
     """Builds the task on a policy's body and writes the run file, with the kinematic policy beside it.
 
+    model: by default that of the run that is there, and of a new one that of Poise.
+
     Raises:
-        PoiseError: the folder holds another run, the kinematic policy is of another body, or it makes
-            frames at another rate.
+        PoiseError: the folder holds another run or one of another kinematic policy, the kinematic policy
+            is of another body, or it makes frames at another rate.
     """
+    if (folder / RUN_FILE).exists():
+        file = held_run(folder, NAME, config, config_of)
+        own = load_generator(folder / GENERATOR)
+        if model is not None and dict(model.about) != dict(own.about):
+            raise PoiseError(
+                "the folder holds a run of another kinematic policy",
+                folder,
+                "Leave the kinematic policy out, or choose another folder",
+                code="settings-differ",
+            )
+        return followed(file, config)
+    model = model or load_generator()
     if model.fps != config.sim.control_hz:
         raise PoiseError(
             f"the kinematic policy makes {model.fps:g} frames a second, the task has "
@@ -56,8 +70,6 @@ def begin(folder: Path, model: GeneratorModel, tracker: Tracker, config: DualPol
             hint=f"Give --set sim.control_hz={model.fps:g}",
             code="rate-differs",
         )
-    if (folder / RUN_FILE).exists():
-        return followed(held_run(folder, NAME, config, config_of), config)
     made = build(model.generator(tracker.humanoid), tracker.humanoid, tracker.example, config)
     made.check(config.num_envs)
     library, meta = ClipLibrary.of(tracker.example), {"recipe": NAME, "config": to_data(config)}
@@ -108,11 +120,6 @@ def shown(model: GeneratorModel, humanoid: Humanoid, example: Clip, config: Dual
 
 class DualRun(Run):
     """A run of the dual policy: `Run`, whose clips are motions of its kinematic policy."""
-
-    @classmethod
-    def of(cls, file: RunFile) -> DualRun:
-        """The run of a run file."""
-        return cls(file.path.parent, file.recipe, config_of(file.meta["config"], file.path), file)
 
     @cached_property
     def task(self) -> Imitation:
