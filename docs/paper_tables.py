@@ -554,6 +554,28 @@ _S2H_WAYS = PaperTable(
     f"{_PAPERS} skeleton-ways",
     printed="no row",
 )
+_DROPOUT = "papers:Skeleton2Humanoid, a stream that drops out for"
+_SHIPS = "as it ships"
+_S2H_DROPOUT = PaperTable(
+    (
+        Measure("error, mm", "gap_error_mm", "0.0", -1),
+        Measure("slide, mm/s", "gap_slide_mm_per_s", "0", -1),
+        Measure("s to adapt", "adapted_s", "0.0"),
+    ),
+    tuple(
+        Claim(
+            f"{n} frames; {name} (ours alone)",
+            f"{_DROPOUT} {n} frames; {name}",
+            "" if name == _SHIPS else "better",
+            "" if name == _SHIPS else f"{_DROPOUT} {n} frames; {_SHIPS}",
+            "" if name == _SHIPS else _SHIPS,
+        )
+        for n in (5, 15)
+        for name in (_SHIPS, "adapted to the gap", "adapted to the last second")
+    ),
+    f"{_PAPERS} skeleton-dropout",
+    printed="no row",
+)
 _ITERATIONS = ("baseline", *(f"iteration {k}" for k in range(1, 8)))
 _ADAPTATION = "papers:Skeleton2Humanoid, adaptation; "
 _ITERATED = f"{_PAPERS} skeleton-iterations"
@@ -1203,6 +1225,7 @@ PAPER_TABLES: dict[str, PaperTable] = {
     "s2h-table-3": _S2H_3,
     "s2h-ik": _S2H_IK,
     "s2h-ways": _S2H_WAYS,
+    "s2h-dropout": _S2H_DROPOUT,
     "s2h-table-4": _S2H_4,
     "s2h-table-5": _S2H_5,
     "s2h-table-6": _S2H_6,

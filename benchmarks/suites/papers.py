@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from benchmarks.suites import (
     papers_compliant,
+    papers_dropout,
     papers_perpetual,
     papers_prediction,
     papers_residual,
@@ -21,6 +22,7 @@ PARTS = (
     | papers_prediction.PARTS
     | papers_skeleton.PARTS
     | papers_ways.PARTS
+    | papers_dropout.PARTS
     | papers_perpetual.PARTS
     | papers_compliant.PARTS
 )
