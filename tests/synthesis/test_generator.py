@@ -11,7 +11,13 @@ import torch
 from torch import Tensor
 
 from poise.env.generator_goal import GeneratorGoal
-from poise.jobs.endless.endless_training import Endless, balanced, motions_of, train_generator
+from poise.jobs.endless.endless_training import (
+    Endless,
+    balanced,
+    motions_of,
+    seeds_of,
+    train_generator,
+)
 from poise.jobs.endless.model import GeneratorModel, Motions, load_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
@@ -106,6 +112,25 @@ def test_labels_are_drawn_more_evenly(motions: Motions) -> None:
         starts = even.frames.starts(4000, 30, torch.Generator().manual_seed(1))
         assert float((starts < first[1]).float().mean()) == pytest.approx(share, abs=0.03)
     assert balanced(many, kinds, Endless(SMALL)) is many
+
+
+def test_motions_begin_as_evenly_as_labels_are_drawn(motions: Motions) -> None:
+    count = len(motions.frames.frames)
+    first = torch.tensor([0, 12, count])
+    frames = PackedFrames(motions.frames.frames, first)
+    plain = replace(
+        motions, frames=frames, clips=("one", "two"), seeds=motions.seeds[:2].repeat(8, 1, 1)
+    )
+    assert seeds_of(plain, SMALL)[0] is plain.seeds
+    weights = torch.tensor([0.0, 1.0])
+    seeds, clips = seeds_of(replace(plain, frames=PackedFrames(frames.frames, first, weights)), SMALL)
+    assert seeds.shape[1:] == (SMALL.past, motions.seeds.shape[-1]) and set(clips.tolist()) == {1}
+    poses = frames.frames[:, -len(motions.hinges) :].unfold(0, SMALL.past, 1).transpose(1, 2)
+    apart = (poses[:, None] - seeds[None, ..., 7:].float()).abs().amax((-2, -1))
+    assert float(apart.amin(0).max()) < 1e-5 and bool((apart.argmin(0) >= 12).all())
+
+
+def test_a_share_is_between_none_and_all() -> None:
     with refused("out-of-range", says="balance"):
         Endless(balance=2.0)
 

@@ -189,9 +189,10 @@ def train_generator(
         "of": c.steps, "seconds": round(trainer.seconds, 1), "seed": c.seed,
     }  # fmt: skip
     codes = codes_of(made, motions, c.codes, kinds) if c.codes else None
+    seeds, clips = seeds_of(motions, made.config)
     model = GeneratorModel(
-        made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about, codes,
-        names_of(labels), kinds[clips_of_seeds(motions, made.config.past)] if labels else None,
+        made, seeds, motions.bounds, motions.hinges, motions.fps, about, codes,
+        names_of(labels), kinds[clips] if labels else None,
     )  # fmt: skip
     model.save(folder / GENERATOR)
     return model, stats, stopped
@@ -217,17 +218,32 @@ def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
     return CVAEObjective(net, config.training, config.steps, motions.weights)
 
 
+def seeds_of(motions: Motions, sizes: CVAEConfig) -> tuple[Tensor, Tensor]:
+    """Pasts `(S, p, 7 + n)` that motions begin from, as likely as windows are, and clips `(S,)`."""
+    if motions.frames.weights is None:
+        return motions.seeds, clips_of_seeds(motions, sizes.past)
+    start = _starts(motions, sizes.past + sizes.future, len(motions.seeds))
+    some = motions.frames.frames[start[:, None] + torch.arange(sizes.past)].double()
+    last = torch.zeros(len(some), motions.seeds.shape[-1]).double()
+    last[:, 3] = 1.0
+    return coordinates(some, last, motions.fps), motions.frames.clip[start]
+
+
+def _starts(motions: Motions, window: int, count: int) -> Tensor:
+    """First frames of at most so many windows, spread as they are drawn."""
+    usable = (motions.frames.room >= window).nonzero()[:, 0]
+    if motions.frames.weights is None:
+        return usable[torch.linspace(0, len(usable) - 1, min(count, len(usable))).long()]
+    share = motions.frames.weights[motions.frames.clip[usable]].double().cumsum(0)
+    at = (torch.arange(count) + 0.5).double() / count * share[-1]
+    return usable[torch.searchsorted(share, at).clamp_max(len(usable) - 1).unique()]
+
+
 @torch.no_grad()
 def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int, kinds: Tensor | None = None) -> Codes:
     """Codes of windows of the library, spread as they are drawn; `kinds (C,)` are the clips' labels."""
     p, window = net.config.past, net.config.past + net.config.future
-    frames, room = motions.frames.frames, motions.frames.room
-    usable = (room >= window).nonzero()[:, 0]
-    start = usable[torch.linspace(0, len(usable) - 1, min(count, len(usable))).long()]
-    if motions.frames.weights is not None:
-        share = motions.frames.weights[motions.frames.clip[usable]].double().cumsum(0)
-        at = (torch.arange(count) + 0.5).double() / count * share[-1]
-        start = usable[torch.searchsorted(share, at).clamp_max(len(usable) - 1).unique()]
+    frames, start = motions.frames.frames, _starts(motions, window, count)
     clip = motions.frames.clip[start]
     codes = Codes(torch.empty(0), torch.empty(0), torch.empty(0), motions.weights.sqrt())
     parts = list[tuple[Tensor, Tensor, Tensor]]()
