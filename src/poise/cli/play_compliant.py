@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.console import Answer, say, table
 from poise.cli.options import (
     Budget,
+    Flag,
     Force,
     Json,
     OpenPage,
@@ -63,6 +64,7 @@ def run(
     seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None,
     policy: PolicyFile = None,
     learned: Annotated[Path | None, arg(metavar="RUN|none", help_behavior_hint="")] = None,
+    recover: Flag = False,
     controller: Literal["policy", "lookahead"] = "policy",
     budget: Budget = None,
     threads: Threads = 0,
@@ -104,6 +106,7 @@ def run(
         learned: what was learned on top of the policy: the folder of poise train compliant SCENE, at
             --level where it learned levels. For the ball something comes along; none goes without.
             pull, hands: also that of poise train compliant-imitation, which stands by itself.
+        recover: get up after a fall and go on; an opponent stays down.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the
             scene.
         budget: simulated control steps of lookahead for each that is made, by default 192.
@@ -149,6 +152,7 @@ def run(
             ("--stiffness", newtons_per_metre),
             ("--policy", policy),
             ("--controller lookahead", controller == "lookahead" or None),
+            ("--recover", recover or None),
         ):
             if value is not None:
                 raise PoiseError(
@@ -182,7 +186,7 @@ def run(
         given = knows.config.played(given)
     with claimed(out):
         with working("simulating"):
-            more = (count, duration, threads, scene, knows, controller, how)
+            more = (count, duration, threads, scene, knows, controller, how, recover)
             played = play(place, tracker, motion, given, *more)
         return told(played, out, given, open)
 

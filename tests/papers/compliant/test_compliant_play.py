@@ -79,6 +79,19 @@ def test_a_pull_and_throws_are_seen(tracker: Tracker) -> None:
     assert "900,000 N" in note and "nobody bears" in note
 
 
+def test_after_a_fall_it_gets_up_and_goes_on(tracker: Tracker) -> None:
+    heavy = Throws(mass=40.0, speed=(4.0, 4.0), every_s=(7.0, 7.0))
+    made = play(heavy, tracker, None, None, 3, seconds=14.0, threads=1, recover=True)
+    a = made.episodes
+    assert a["falls"].sum() >= 1 and 0 < a["up_again"].sum() <= a["falls"].sum()
+    assert {"falls", "up_again"} <= set(made.words) and made.figures["falls"] == a["falls"].sum()
+    height = made.evaluation.rollouts.pos[:, :, 0, 2]
+    lay = height.amin(1) < 0.4
+    assert bool((lay & (height[:, -1] > 0.8) & torch.tensor(a["up_again"] == a["falls"])).any())
+    with refused("recovery-not-learned"):
+        play(heavy, replace(tracker, recovery_clips=None), None, recover=True)
+
+
 def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:
     made = play(DoorScene(1.0), tracker, None, Stiffness(500.0, 0.5), 2, threads=1, name="door")
     for figures in (made.figures, made.stiff):

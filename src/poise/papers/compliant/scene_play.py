@@ -19,6 +19,8 @@ import torch
 
 from poise.control import Compliance, Stiffness
 from poise.env import Acts, ImitationEnv
+from poise.env.recovery.get_up import RecoveryClips
+from poise.env.recovery.recovering import Recovering
 from poise.errors import PoiseError
 from poise.formats import write_clip
 from poise.formats.text import write_whole
@@ -33,7 +35,7 @@ from poise.papers.compliant.motions import motion_of
 from poise.papers.compliant.opponents import opposing, rival_stage
 from poise.papers.compliant.scene_training import LearnedOnTop, Topped, at_rate, seen, set_up
 from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
-from poise.papers.compliant.watch import Watch, meter_of, words_of
+from poise.papers.compliant.watch import Watch, meter_of
 from poise.plan import LookaheadConfig
 from poise.recipes.imitation import Imitation
 from poise.score import run_episodes, write_score
@@ -43,7 +45,7 @@ from poise.score.rollouts import RolloutSet
 #: m/s^2; greatest force, in weights of a character, about which nothing is said.
 G, MOST_WEIGHTS = 9.81, 20.0
 #: Figures of which episodes are counted.
-COUNTS = frozenset(("lost", "opened", "touched", "rival_fell"))
+COUNTS = frozenset(("lost", "opened", "touched", "rival_fell", "falls", "up_again"))
 #: What the figures are, in words.
 WORDS = {
     "force_mean_n": "Interaction force, mean while it acts, N",
@@ -168,7 +170,7 @@ def played(scene: PlayScene, one: Looked, stiff: Looked, name: str = "") -> Play
     called = name or next(k for k, kind in SCENES.items() if kind is type(scene))
     return Played(
         called,
-        {**WORDS, **words_of(scene)},
+        {**WORDS, **one.watch.words},
         one.task,
         one.evaluation,
         {k: v.numpy() for k, v in one.watch.figures(one.rollouts, one.task).items()},
@@ -200,6 +202,7 @@ def play(
     learned: LearnedOnTop | None = None,
     controller: Literal["policy", "lookahead"] = "policy",
     lookahead: LookaheadConfig | None = None,
+    recover: bool = False,
 ) -> Played:
     """A scene with compliance and without, from the same starts, which are off by `scene.starts`.
 
@@ -214,9 +217,12 @@ def play(
         controller: the policy alone, or with lookahead, which simulates the scene with all that is going
             to happen in it; not with what was learned on top, nor against an opponent.
         lookahead: how it looks ahead.
+        recover: get up after a fall and go on with the motion, which waits so long; an opponent stays
+            down.
 
     Raises:
-        PoiseError: the body cannot do the scene, or the clip cannot be read.
+        PoiseError: the body cannot do the scene, the clip cannot be read, or the policy has not learned
+            to get up.
     """
     if controller == "lookahead" and (learned or getattr(scene, "against", "") == "rival"):
         what = "against an opponent" if learned is None else "with what was learned on top"
@@ -227,6 +233,13 @@ def play(
             code="settings-conflict",
         )
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
+    if recover and tracker.recovery_clips is None:
+        raise PoiseError(
+            "the policy has not learned to get up",
+            name or "play",
+            "Leave recover out, or train one on a library with a clip that gets up",
+            code="recovery-not-learned",
+        )
     tracker = at_rate(scene, tracker)
     if clip is not None and motion_of(scene, tracker, seconds) is not None:
         raise PoiseError(
@@ -251,7 +264,8 @@ def play(
         if top is not None:
             own = replace(own, obs=(*own.obs, *seen(stage, top.config)))
         ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
-        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
+        own = replace(task, task=own)
+        both.append(_episodes(scene, tracker, own, count, threads, top, ahead, recover))
     return played(scene, both[0], both[1], name)
 
 
@@ -267,14 +281,18 @@ def _episodes(
     threads: int,
     learned: LearnedOnTop | None = None,
     lookahead: LookaheadConfig | None = None,
+    recover: bool = False,
 ) -> Looked:
     topped = None if learned is None else Topped(tracker.policy, learned.top, learned.added)
     ahead = look_ahead(tracker, task, lookahead, threads) if lookahead else None
     begin = [] if topped is None else [topped.begin]
     begin += [] if ahead is None else [ahead.watch]
-    acts = ahead or topped or tracker.policy
+    acts, said = ahead or topped or tracker.policy, tracker.about
+    clips = tracker.recovery_clips if recover else None
+    if ahead is not None and clips is not None:
+        ahead.copies.set_goal(Recovering(ahead.copies.goal.clips, clips, plans=False))
     try:
-        return looked_at(scene, acts, task, count, threads, tracker.about, begin, tracker.config.method)
+        return looked_at(scene, acts, task, count, threads, said, begin, tracker.config.method, clips)
     finally:
         if ahead is not None:
             ahead.copies.close()
@@ -289,17 +307,22 @@ def looked_at(
     about: Mapping[str, Any] | None = None,
     begin: Sequence[Callable[[ImitationEnv], Any]] = (),
     method: str = "",
+    recovery_clips: RecoveryClips | None = None,
 ) -> Looked:
     """Episodes of a task that stands in a scene, from the first frame off by `scene.starts`.
 
     Args:
         about: what the training of the policy took. begin: are told the environment before it acts.
         method: what the score card calls it.
+        recovery_clips: by which a character gets up that has fallen; None leaves it where it is.
     """
     zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
 
     def make(worlds: int) -> ImitationEnv:
         env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
+        if recovery_clips is not None:
+            env.reset_to(zero, zero)
+            env.set_goal(Recovering(env.goal.clips, recovery_clips))
         watch.begin(env)
         for told in begin:
             told(env)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.events import Felt, Force
+from poise.env.recovery.recovering import Recovering
 from poise.env.scene_events import ScenePart
 from poise.env.yielding import DisplacedGoal
 from poise.jobs.result import RULE
@@ -79,11 +80,14 @@ class Watch:
         self.arrows: list[np.ndarray] = []
         self._ways: list[np.ndarray] = []
         self._felt: list[Force] = []
+        self._recovering: Recovering | None = None
 
     def begin(self, env: ImitationEnv) -> None:
         """Looks at an environment from now on."""
         n = env.num_envs
         self._felt = [event for event in env.events if isinstance(event, Force)]
+        goal = env.goal.goal if isinstance(env.goal, DisplacedGoal) else env.goal
+        self._recovering = goal if isinstance(goal, Recovering) else None
         self._step_s = env.substeps * float(env.backend.model.opt.timestep)
         names = ("impulse", "sum", "peak", "acts", "torque", "steps", "moved")
         self._sums = {k: torch.zeros(n, dtype=torch.float64) for k in names}
@@ -167,9 +171,30 @@ class Watch:
             "off_m": off,
             "lost": lost,
         }
+        if self._recovering is not None:
+            found |= falls_of(self._recovering)
         if self.meter is not None:
             found |= self.meter.figures()
         return {k: v.double().cpu() for k, v in found.items()}
+
+    @property
+    def words(self) -> Mapping[str, str]:
+        """What figures are that not all scenes have."""
+        own = {} if self.meter is None else self.meter.words
+        return own if self._recovering is None else {**FALLS_WORDS, **own}
+
+
+#: What falls are where a character gets up, in words.
+FALLS_WORDS = {"falls": "Times that a character lost its motion", "up_again": "Times that it came back"}
+
+
+def falls_of(goal: Recovering) -> dict[str, Tensor]:
+    """How often each world's character lost its motion, and came back to it, `(E,)`."""
+    worlds = {"falls": goal.lost, "up_again": goal.back}
+    return {
+        k: torch.tensor([i for i, _ in v], dtype=torch.long).bincount(minlength=goal.num_envs)
+        for k, v in worlds.items()
+    }
 
 
 def footfalls(height: Tensor, lifted: float = UP_M) -> Tensor:
@@ -370,9 +395,3 @@ def meter_of(scene: PlayScene) -> Meter | None:
     """The meter of a scene, None where it has no figures of its own."""
     make = METERS.get(type(scene))
     return None if make is None else make()
-
-
-def words_of(scene: PlayScene) -> Mapping[str, str]:
-    """What the figures of a scene's own are."""
-    made = meter_of(scene)
-    return {} if made is None else made.words
