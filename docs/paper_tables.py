@@ -223,6 +223,8 @@ _ANGLES = (
     Measure("MAE, rad", "mae_rad", "3", -1),
     Measure("FAE, rad", "fae_rad", "3", -1),
     share("fallen", "fallen", -1),
+    Measure("root, m", "root_m", "2", -1),
+    Measure("diversity, rad", "diversity_rad", "2"),
 )
 _TABLE_1 = PaperTable(
     _ANGLES,

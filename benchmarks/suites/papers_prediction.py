@@ -4,8 +4,9 @@ Cross holds whole subjects out, Mix every fifth clip of a class; one model learn
 class has one of its own. The kinematic policy (ours), ERD and acLSTM learn for the same processor time;
 control policies make as many control steps, a third of them where they go on from the policy that comes
 with Poise. MAE is the mean over 2 s of the Euclidean distance between hinge angles, rad, FAE that of the
-last frame (the paper's words; of all hinges, without the root). "zero velocity" and "servos" are the
-nulls.
+last frame (the paper's words; of all hinges, without the root). Beside them stand how far the root is
+off, how far futures of one past are apart, and how many have fallen. "zero velocity" and "servos" are
+the nulls.
 """
 
 from __future__ import annotations
@@ -456,7 +457,9 @@ SAMPLES = 10
 
 
 #: Steps of a network, which take about as long as each other on one core.
-STEPS = {"ours": 280, "ERD": 80, "acLSTM": 30, "next frame": 170}
+STEPS = {"ours": 1_680, "ERD": 480, "acLSTM": 180, "next frame": 1_020}
+#: Control steps that a control policy learns from.
+CONTROL_STEPS = 98_304
 
 
 #: Methods that draw nothing.
@@ -530,6 +533,20 @@ def figures(windows: list[Window], far: np.ndarray) -> dict[str, dict[str, Any]]
     return out
 
 
+def root_off(windows: list[Window], qpos: Tensor, samples: int) -> float:
+    """How far roots are from the recorded ones, the mean over all frames, m."""
+    true = torch.stack([w.true[:, :3] for w in windows]).repeat_interleave(samples, 0)
+    return round(float((qpos[..., :3] - true).norm(dim=-1).mean()), 3)
+
+
+def diversity(windows: list[Window], qpos: Tensor, samples: int) -> float | None:
+    """How far futures of one past are apart, the mean over frames and pairs, rad; None of one future."""
+    if samples < 2:
+        return None
+    each = qpos[..., 7:].unflatten(0, (len(windows), samples)).transpose(1, 2).flatten(0, 1)
+    return round(float(torch.cdist(each, each).sum((1, 2)).mean()) / (samples * (samples - 1)), 3)
+
+
 def fallen(windows: list[Window], qpos: Tensor, samples: int) -> float:
     """Share of the characters that end far lower than what was recorded."""
     height = torch.stack([w.true[-1, 2] for w in windows]).repeat_interleave(samples)
@@ -600,6 +617,8 @@ class Rows:
             }
         count = len(qpos) // len(self.windows)
         about |= {"samples": count, "fallen": fallen(self.windows, qpos, count)}
+        about["root_m"] = root_off(self.windows, qpos, count)
+        about["diversity_rad"] = diversity(self.windows, qpos, count)
         far = off(self.windows, qpos, count)
         return about | {"groups": figures(self.windows, far)}, far
 
@@ -645,7 +664,7 @@ def held_out_windows(places: Places, tracker: Tracker) -> list[Window]:
 def rows_of(places: Places, unit: Unit) -> Rows:
     """The rows of one model of one seed, which share networks in a process."""
     clips, tracker = windows_and_clips(places, unit.library)
-    return Rows(unit, clips, tracker, *((128, 0.01) if places.smoke else (49_152, 1.0)))
+    return Rows(unit, clips, tracker, *((128, 0.002) if places.smoke else (CONTROL_STEPS, 1.0)))
 
 
 def units(places: Places) -> list[str]:
@@ -683,7 +702,9 @@ def predicted_rows(places: Places, raws: Raws) -> Iterator[Figure]:
             if own := r["groups"].get(split):
                 values = {"mae_rad": own["mae"], "fae_rad": own["fae"], "best_mae_rad": own["best_mae"]}
                 if split == "all":
-                    values |= {"fallen": r["fallen"], "help_n": r.get("help_n")}
+                    told = ("fallen", "help_n", "root_m", "diversity_rad")
+                    values |= {k: r.get(k) for k in told}
+                    values["samples"] = r.get("control_steps") or None
                 subject = f"{table}; {unit}" if split == "all" else f"{table}; {unit}, {split}"
                 yield from of(subject, values, own["windows"], policy=policy)
     for library in dict.fromkeys(u.partition("/")[0] for u in raws):
