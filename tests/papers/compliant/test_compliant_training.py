@@ -20,6 +20,7 @@ from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.papers.compliant.figures import throws
 from poise.papers.compliant.scene_play import play
 from poise.papers.compliant.scene_training import (
+    RUN_FILE,
     Added,
     Compliant,
     OnTop,
@@ -98,6 +99,13 @@ def test_a_tiny_training_goes_on_and_is_played(tracker: Tracker, tmp_path: Path)
             open_learned(one, tracker)
     with refused("settings-differ"):
         train(replace(TINY, seed=1), tracker, tmp_path / "a", Until(iterations=3), threads=1)
+    with refused("policies-differ"):
+        train(TINY, another(tracker), tmp_path / "a", Until(iterations=3), threads=1)
+    # Runs of earlier versions do not say what they lie on.
+    run_file = tmp_path / "a" / RUN_FILE
+    told = json.loads(run_file.read_text())
+    run_file.write_text(json.dumps({k: v for k, v in told.items() if k != "below"}))
+    assert learned.below is not None and open_learned(tmp_path / "a", another(tracker)).below is None
     with refused("not-a-run"):
         open_learned(tmp_path, tracker)
     # A new run goes on from it, unless it sees something else.
@@ -122,9 +130,16 @@ def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
     made = play(learned.config.play(), tracker, None, None, 2, 5.0, 1, "ball", learned)
     # A rod that nobody balances has fallen after 1.5 s.
     assert made.figures["stays_s"] > 4.9 and made.stiff["stays_s"] < 2.0 and made.figures["lost"] == 0
+    assert shipped("ball", another(tracker)) is None
+    with refused("policies-differ"):
+        play(learned.config.play(), another(tracker), None, None, 2, 5.0, 1, "ball", learned)
+
+
+def another(tracker: Tracker) -> Tracker:
+    """The same body with other weights."""
     other = replace(tracker, policy=tracker.policy.copy())
     other.policy.load_state({k: 1.01 * v for k, v in tracker.policy.state().items()})
-    assert shipped("ball", other) is None
+    return other
 
 
 @pytest.mark.parametrize("scene", ["throws", "hands", "trampoline", "chicken"])

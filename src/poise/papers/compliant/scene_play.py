@@ -255,6 +255,7 @@ def play(
         task = replace(task, props=stage.props, touches=stage.touches)
     both: list[Looked] = []
     if learned is not None:
+        learned.check(tracker)
         given = learned.config.played(given)
     for compliance in (stage.yields(given), None):
         others = () if rival is None else (opposing(rival, tracker, compliance),)

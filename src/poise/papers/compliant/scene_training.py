@@ -440,11 +440,28 @@ class LearnedOnTop:
         config: its settings.
         top: the policy.
         added: what its actions are.
+        below: the digest of the policy that it was learned on; None of earlier versions' runs.
     """
 
     config: Compliant
     top: PolicyBundle
     added: Added
+    below: str | None = None
+
+    def check(self, tracker: Tracker) -> None:
+        """Refuses to act on another policy than it was learned on.
+
+        Raises:
+            PoiseError: the policies' weights differ.
+        """
+        if self.below is None or self.below == digest_of(tracker.policy):
+            return
+        raise PoiseError(
+            f"what was learned of {self.config.scene} lies on another policy",
+            hint="Give the policy that it was trained on, or train on with poise train compliant "
+            f"{self.config.scene} --from RUN",
+            code="policies-differ",
+        )
 
     def over(self, tracker: Tracker, env: ImitationEnv) -> Topped:
         """Both policies as one that acts in an environment, which observes what `seen` says."""
@@ -453,23 +470,33 @@ class LearnedOnTop:
         return topped
 
 
-def begin(folder: Path, config: Compliant) -> Compliant:
+def begin(folder: Path, config: Compliant, below: str) -> Compliant:
     """Writes the run file, or reads that of the run that is there.
 
+    below: the digest of the policy that is learned on.
+
     Raises:
-        PoiseError: the folder holds a run with other settings.
+        PoiseError: the folder holds a run with other settings, or on another policy.
     """
     file = folder / RUN_FILE
     if file.exists():
-        held = _read(file)
+        held, known = _read(file)
         if held != config:
             hint = "Resume it as it is or choose another folder"
             raise PoiseError(
                 "the folder holds a run with other settings", folder, hint, code="settings-differ"
             )
+        if known not in (None, below):
+            raise PoiseError(
+                "the folder holds a run on another policy",
+                folder,
+                "Give the policy of --policy that it began with, or choose another folder",
+                code="policies-differ",
+            )
         return held
     folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps({"recipe": "compliant", "config": to_data(config)}, indent=1) + "\n")
+    told = {"recipe": "compliant", "config": to_data(config), "below": below}
+    file.write_text(json.dumps(told, indent=1) + "\n")
     return config
 
 
@@ -531,7 +558,7 @@ def train(
             "State the settings by which it was learned",
             code="policy-unfit",
         )
-    begin(folder, config)
+    begin(folder, config, digest_of(tracker.policy))
     with only_writer(folder):
         trainer = Trainer(
             cast(VecEnv, on_top), config.learner(env.hinges), config.seed,
@@ -584,20 +611,23 @@ def open_learned(folder: Path, tracker: Tracker) -> LearnedOnTop:
             hint = "Give the folder of poise train compliant, or a file that was saved from it"
             raise PoiseError("holds nothing of the recipe compliant", folder, hint, code="not-a-run")
         config = config_of(told["config"], folder)
-        return _fitting(policy_in(tensors, meta, folder), config, tracker, folder)
+        below = str(told["below"]) if "below" in told else None
+        return _fitting(policy_in(tensors, meta, folder), config, tracker, folder, below)
     file = folder / RUN_FILE
     if not file.exists():
         hint = "Give the folder of poise train compliant"
         raise PoiseError("holds no run of the recipe compliant", folder, hint, code="not-a-run")
-    config = _read(file)
+    config, below = _read(file)
     if not (folder / LATEST).exists():
         raise PoiseError(
             "nothing was trained in it yet", folder, "Train it for some minutes", code="nothing-trained"
         )
-    return _fitting(load_policy(folder / LATEST), config, tracker, folder)
+    return _fitting(load_policy(folder / LATEST), config, tracker, folder, below)
 
 
-def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Path) -> LearnedOnTop:
+def _fitting(
+    top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Path, below: str | None
+) -> LearnedOnTop:
     """Refuses what was trained on another body."""
     added = config.added(tracker.policy.num_obs)
     if top.num_actions != added.width(len(tracker.humanoid.hinges)):
@@ -607,13 +637,14 @@ def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Pat
             "Give the policy it was trained on",
             code="bodies-differ",
         )
-    return LearnedOnTop(config, top, added)
+    return LearnedOnTop(config, top, added, below)
 
 
-def _read(file: Path) -> Compliant:
+def _read(file: Path) -> tuple[Compliant, str | None]:
+    """The settings of a run, and the digest of the policy that it learns on, where it is known."""
     try:
         data = json.loads(file.read_text("utf-8"))
-        return config_of(data["config"], file)
+        return config_of(data["config"], file), data.get("below")
     except (ValueError, KeyError, TypeError) as problem:
         raise PoiseError(
             "is no run file of the recipe compliant", file, code="wrong-file-kind"
