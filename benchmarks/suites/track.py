@@ -11,7 +11,7 @@ import resource
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -117,20 +117,23 @@ def estimated(places: Places, unit: str) -> Any:
 # --- noise, sizes, an hour ------------------------------------------------------------------------
 
 
-def noisy(places: Places, unit: str) -> Any:
+def noisy(places: Places, unit: str, controller: Literal["policy", "lookahead"] = "policy") -> Any:
     """A clip's success at each strength of a video estimator's errors."""
     strengths = STRENGTHS[:2] if places.smoke else STRENGTHS
     levels = robustness_levels(strengths=strengths)
-    return robustness(policy_of("tracker"), [clip_of(places, "bandai", unit)], levels).to_dict()["rungs"]
+    clips = [clip_of(places, "bandai", unit)]
+    return robustness(policy_of("tracker"), clips, levels, controller=controller).to_dict()["rungs"]
 
 
-def noisy_rows(places: Places, raws: Raws) -> Iterator[Figure]:
-    """Shares by strength."""
+def noisy_rows(places: Places, raws: Raws, words: str = "policy alone") -> Iterator[Figure]:
+    """Shares by strength: done to the end of what came in, and within half a metre of the motion without
+    errors."""
+    names = {"succ": "done", "succ_clean": "near_truth", "tracked": "tracked"}
     for k, rung in enumerate(next(iter(raws.values()))):
         rows = [raw[k] for raw in raws.values()]
-        subject = f"{SETS['bandai'].title}, noise {rung['name']}; policy alone"
-        numbers = {m: mean_of(r[m] for r in rows) for m in ("succ", "tracked") if m in rung}
-        yield from of(subject, {"done" if m == "succ" else m: v for m, v in numbers.items()}, len(rows))
+        subject = f"{SETS['bandai'].title}, noise {rung['name']}; {words}"
+        numbers = {told: mean_of(r[m] for r in rows) for m, told in names.items() if m in rung}
+        yield from of(subject, numbers, len(rows))
 
 
 def pushed(places: Places, unit: str) -> Any:
@@ -264,6 +267,14 @@ PARTS = {
         noisy_rows,
         ("tracker",),
         hours=0.1,
+    ),
+    "noise, lookahead": Part(
+        "the same with lookahead",
+        lambda p: names_of(p, "bandai")[::7],
+        partial(noisy, controller="lookahead"),
+        partial(noisy_rows, words="with lookahead"),
+        ("tracker",),
+        hours=0.3,
     ),
     "pushes": Part(
         "blows to the chest",
