@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
+from poise.body.humanoid import make_humanoid
 from poise.jobs.open import open_run
 from poise.sim import (
     Character,
@@ -47,8 +48,14 @@ def standing(humanoid: Humanoid, count: int, x: float = 0.0, z: float = 1.0) -> 
     return qpos, torch.zeros(count, model.nv, dtype=torch.float64)
 
 
-def test_bodies_of_soft_characters_meet_softly_and_the_floor_as_ever(humanoid: Humanoid) -> None:
+@pytest.mark.parametrize("soft_s", [None, 0.05])
+def test_bodies_of_soft_characters_meet_softly_and_the_floor_as_ever(
+    humanoid: Humanoid, soft_s: float | None
+) -> None:
     """A contact of two characters has an impedance of a half, so that a wedged limb is not torn at."""
+    if soft_s is not None:
+        table = humanoid.table.overridden({"soft_s": soft_s})
+        humanoid = make_humanoid(humanoid.skeleton, table)
 
     def contacts(*characters: Character) -> dict[bool, set[tuple[float, ...]]]:
         model = Scene(characters).compile().model
@@ -59,14 +66,17 @@ def test_bodies_of_soft_characters_meet_softly_and_the_floor_as_ever(humanoid: H
         found: dict[bool, set[tuple[float, ...]]] = {True: set(), False: set()}
         for c in data.contact:
             floor = 0 in model.geom_bodyid[list(c.geom)]
-            found[floor].add((*c.solref.tolist(), *c.solimp.tolist(), *c.friction.tolist(), c.dim))
+            numbers = (*c.solref.tolist(), *c.solimp.tolist(), *c.friction.tolist(), c.dim)
+            found[floor].add(tuple(round(x, 12) for x in numbers))
         return found
 
     alone_ = contacts(Character(humanoid))
     both = contacts(Character(humanoid, "a"), Character(humanoid, "b", soft=True))
     assert both[True] == alone_[True] and len(both[True]) == 1 and not alone_[False]
-    (between,) = both[False]
+    (between,), (under,) = both[False], both[True]
     assert between[2:4] == (0.5, 0.5)
+    if soft_s is not None:
+        assert between[0] == soft_s and under[0] == pytest.approx(soft_s, rel=0.01)
 
 
 def free(*rows: tuple[float, ...]) -> tuple[Tensor, Tensor]:

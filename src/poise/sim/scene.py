@@ -14,9 +14,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import mujoco
+import numpy as np
 
 from poise.body import Humanoid
 from poise.body.humanoid import add_humanoid
@@ -212,9 +213,23 @@ def _soften(spec: mujoco.MjSpec, characters: tuple[Character, ...]) -> None:
     for character in characters:
         for name in character.humanoid.bodies:
             for geom in spec.body(character.prefix + name).geoms:
+                if geom.solmix != 1.0:
+                    _keep(spec, geom)
                 # Parameters of a pair are mixed by weight, and 0 against anything counts nothing.
                 geom.solmix = 0.0
                 geom.solimp[:2] = [FLESH, FLESH]
+
+
+def _keep(spec: mujoco.MjSpec, soft: Any) -> None:
+    """States how a geom that is soft by itself touches what the world stands on: as without `FLESH`."""
+    for other in spec.worldbody.geoms:
+        share = soft.solmix / (soft.solmix + other.solmix)
+        pair = spec.add_pair(geomname1=soft.name, geomname2=other.name)
+        pair.condim = max(soft.condim, other.condim)
+        friction = [max(a, b) for a, b in zip(soft.friction, other.friction, strict=True)]
+        pair.friction = [friction[0], friction[0], friction[1], friction[2], friction[2]]
+        pair.solref = list(share * np.array(soft.solref) + (1 - share) * np.array(other.solref))
+        pair.solimp = list(share * np.array(soft.solimp) + (1 - share) * np.array(other.solimp))
 
 
 def _check(name: str, known: list[str], where: str) -> None:
