@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch.optim import Adam
 
-from benchmarks.common.clips import WALK, Places
+from benchmarks.common.clips import WALK, Places, clip_of, names_of
 from benchmarks.common.rows import Figure, mean_of, median_of, of
 from benchmarks.common.runner import Part, Raws
 from poise.formats import read_clip
@@ -30,7 +30,6 @@ from poise.jobs.inbetween.fill import inbetween, shipped_model
 from poise.learn.inbetween_model import Adaptation, InbetweenModel, load_model, test_loss
 from poise.learn.transition import Known, joint_positions
 from poise.motion import Clip, resample, trim
-from poise.score.gaps import BANDAI
 from poise.synthesis.filler import OtherRig
 from poise.synthesis.windows import step_contacts
 
@@ -61,11 +60,9 @@ def window(places: Places, number: int, length: int) -> Clip:
     need = SECOND + length + AFTER
     if places.smoke:
         return trim(resample(read_clip(WALK), FPS), number, number + need - 1)
-    files = sorted((places.data / "other" / "bandai_bvh").glob("*.bvh"))
-    kept = [f for f in files if not re.search(BANDAI.final, f.name)]
-    rng = np.random.default_rng(number)
+    kept, rng = names_of(places, "bandai"), np.random.default_rng(number)
     while True:
-        clip = resample(read_clip(kept[int(rng.integers(len(kept)))]), FPS)
+        clip = resample(clip_of(places, "bandai", kept[int(rng.integers(len(kept)))]), FPS)
         if clip.frames > need:
             first = int(rng.integers(clip.frames - need))
             return trim(clip, first, first + need - 1)

@@ -8,16 +8,14 @@ the policy alone. Jerk is of the joints' centres, on the way only.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common.clips import Places, moment
+from benchmarks.common.clips import Places, clip_of, moment, names_of
 from benchmarks.common.rows import Figure, median_of, of
 from benchmarks.common.runner import Part, Raws
-from poise.formats import read_clip
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.result import TRACKED
 from poise.jobs.track import track
@@ -25,7 +23,6 @@ from poise.kinematics.travel import moved_by
 from poise.metrics import jerk
 from poise.motion import Clip, resample, trim
 from poise.motion.rotations import heading_angle
-from poise.score.gaps import BANDAI
 
 #: Pairs; s of each clip; frames a second; m between the clips; rad by which the way bends and the second
 #: one turns, to either side; m/s of the way, and s to set off and to arrive.
@@ -45,9 +42,9 @@ def pair_of(places: Places, unit: str) -> tuple[Clip, Clip, float]:
     if places.smoke:
         first, then = moment("a"), moment("b")
     else:
-        files = sorted((places.data / "other" / "bandai_bvh").glob("*.bvh"))
-        kept = [f for f in files if not re.search(BANDAI.final, f.name)]
-        both = [resample(read_clip(kept[k]), FPS) for k in rng.choice(len(kept), 2, replace=False)]
+        kept = names_of(places, "bandai")
+        picks = rng.choice(len(kept), 2, replace=False)
+        both = [resample(clip_of(places, "bandai", kept[k]), FPS) for k in picks]
         first, then = (trim(c, 0, min(c.frames - 1, round(LASTS * FPS))) for c in both)
     away, ahead = float(rng.uniform(*AWAY)), float(heading_angle(first.rot[-1, 0]))
     bend, turn = rng.uniform(-BENDS, BENDS), rng.uniform(-TURNS, TURNS)

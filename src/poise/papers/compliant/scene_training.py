@@ -465,6 +465,7 @@ class LearnedOnTop:
 
     def over(self, tracker: Tracker, env: ImitationEnv) -> Topped:
         """Both policies as one that acts in an environment, which observes what `seen` says."""
+        self.check(tracker)
         topped = Topped(tracker.policy, self.top, self.added)
         topped.begin(env)
         return topped
