@@ -162,7 +162,9 @@ class Circles(Stands):
         super().__init__(pose)
         self.asked = 0
 
-    def propose(self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor) -> Tensor:
+    def propose(
+        self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor, usual: int | None = None
+    ) -> Tensor:
         self.asked += 1
         out = past[:, None, -1:].repeat(1, count, self.future, 1)
         angle = torch.linspace(0, 2 * torch.pi, count).double()

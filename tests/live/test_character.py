@@ -159,7 +159,9 @@ class Line:
     def begin(self, count: int, rng: torch.Generator) -> Tensor:
         return torch.zeros(count, self.past, 7, dtype=torch.float64)
 
-    def propose(self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor) -> Tensor:
+    def propose(
+        self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor, usual: int | None = None
+    ) -> Tensor:
         made = past[:, None, -1:].repeat(1, count, self.future, 1)
         speeds = torch.arange(1, count + 1)[:, None] * torch.arange(1, self.future + 1)
         made[..., 0] += speeds

@@ -32,7 +32,12 @@ class Ways(Stands):
         return self.propose(past, rng, 1, ids)[:, 0]
 
     def propose(
-        self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor | None = None
+        self,
+        past: Tensor,
+        rng: torch.Generator,
+        count: int,
+        ids: Tensor | None = None,
+        usual: int | None = None,
     ) -> Tensor:
         made = past[:, None, -1:].repeat(1, count, self.future, 1)
         flies = ~self.stands[torch.arange(count) % len(self.stands)]

@@ -324,7 +324,8 @@ class GeneratorGoal(BufferedGoal):
         propose = self.generator.propose  # type: ignore[attr-defined]
         ids = torch.tensor([world], device=self.device)
         if not self.steering.chooses:
-            return Futures(propose(past, self.rng, count, ids if wished else None)[0])
+            # Without a place to go, what is usual is as varied as the library.
+            return Futures(propose(past, self.rng, count, ids if wished else None, count)[0])
         last, target = past[0, -1].double(), self._target(world)
         path, begun = self._path(world, last)
         goes = target is not None or path is not None

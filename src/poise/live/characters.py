@@ -233,7 +233,7 @@ class EndlessCoords:
     def _futures(self, count: int, near: bool, others: Sequence[Tensor]) -> Tensor:
         """`(count, f, 7 + n)`, those that keep away from the others first, where they are near."""
         one = torch.zeros(1, dtype=torch.long)
-        made = self._generator.propose(self._past, self._rng, count, one)[0]
+        made = self._generator.propose(self._past, self._rng, count, one, None if near else count)[0]
         return made[cost_of(made[..., :2], None, others).argsort(stable=True)] if near else made
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: m of mean distance from a future within which a copy does it, and at its end, since from farther off
 #: it would not go on well.
-NEAR_M, END_M = 0.25, 0.15
+NEAR_M, END_M = 0.4, 0.3
 #: Times that futures are drawn until one is done.
 ROUNDS = 8
 #: Frames before a copy has lost a future that are left out where no copy does one, and the fewest kept.

@@ -284,14 +284,19 @@ class Kinematic:
 
     @torch.no_grad()
     def propose(
-        self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor | None = None
+        self,
+        past: Tensor,
+        rng: torch.Generator,
+        count: int,
+        ids: Tensor | None = None,
+        usual: int | None = None,
     ) -> Tensor:
         """`(n, count, future, 7 + n)`: several futures of each past, as worlds `ids (n,)` wish, if they
-        are told. One alone is drawn as usual. Of more, one in `USUAL` is; the others are what followed
+        are told. So many are drawn as `usual`, by default one in `USUAL`; the others are what followed
         the most similar pasts, as many as there is room for, bent to either side as far as the character
         walks: somewhere to go is not left to chance."""
         own = past_features(past.double(), self.fps).float()
-        usual = -(-count // USUAL)
+        usual = -(-count // USUAL) if usual is None else usual
         kinds = -(-(count - usual) // BENDS)
         frames = own.repeat_interleave(usual + kinds, 0)
         codes = self._codes(own, usual, kinds, rng, ids)
