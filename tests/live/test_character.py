@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
@@ -19,10 +17,8 @@ from poise.live.characters import (
     TRACKS,
     CharacterGoals,
     CharacterState,
-    EndlessCoords,
 )
 from poise.motion.rotations import facing
-from poise.plan.rehearsal import TriedFuture
 
 RATE = 30.0
 
@@ -149,40 +145,3 @@ def test_after_a_leap_it_walks_to_who_stands_and_goes_on_with_who_walks(
     if not speed:
         assert float((frame[:2] - person.read()[:2]).norm()) < 0.3
     assert character.doing == TRACKS and character.recovered == 0
-
-
-class Line:
-    """Goes on along x, each future at a speed of its own; stands for a generator and for what tries."""
-
-    past, future = 3, 8
-
-    def begin(self, count: int, rng: torch.Generator) -> Tensor:
-        return torch.zeros(count, self.past, 7, dtype=torch.float64)
-
-    def propose(
-        self, past: Tensor, rng: torch.Generator, count: int, ids: Tensor, usual: int | None = None
-    ) -> Tensor:
-        made = past[:, None, -1:].repeat(1, count, self.future, 1)
-        speeds = torch.arange(1, count + 1)[:, None] * torch.arange(1, self.future + 1)
-        made[..., 0] += speeds
-        return made
-
-    def __len__(self) -> int:
-        return 4
-
-    def stand(self, past: Tensor) -> None:
-        self.stood = past.clone()
-
-    def find(self, futures: Callable[[int], Tensor], begin: Callable[[], None]) -> TriedFuture:
-        assert len(futures(0)) == len(self) and len(futures(1)) == len(self)
-        begin()
-        return TriedFuture(1, 2, 5, False)
-
-
-def test_endless_motion_takes_the_future_that_was_done() -> None:
-    line = Line()
-    coords = EndlessCoords(line, trials=lambda: line)  # type: ignore[arg-type]
-    seen = [coords.next() for _ in range(8)]
-    # Five frames of the third future, then the next ones from there.
-    assert [float(f[0]) for f in seen if f is not None] == [3.0 * k for k in range(1, 8)]
-    assert len(line.stood) == Line.past

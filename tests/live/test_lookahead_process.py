@@ -43,7 +43,6 @@ def test_the_loop_goes_on_while_another_process_decides_and_after_its_end() -> N
     tracker = open_run(None).tracker
     others = multiprocessing.active_children()
     world = LiveWorld(tracker, 2, lookahead=(0,), beside=True)
-    (process,) = (p for p in multiprocessing.active_children() if p not in others)
     ahead = world.ahead
     assert isinstance(ahead, AheadBeside)
     ease = torch.stack([c.ease for c in world.characters])
@@ -51,6 +50,7 @@ def test_the_loop_goes_on_while_another_process_decides_and_after_its_end() -> N
     world.step(ease)
     assert world.looked == 0
     assert decisions(ahead, 2, lambda: world.step(ease)) == 2
+    (process,) = (p for p in multiprocessing.active_children() if p not in others)
     assert world.looked > 0 and bool(world.rows.state.qpos.isfinite().all())
     assert max(world.step(ease).off_m) < 0.3
     # Asked for once more, it begins anew.

@@ -132,8 +132,8 @@ def test_copies_stand_where_a_past_ends(tracker: Tracker, task: Imitation) -> No
         return ways.propose(past[None], torch.Generator(), 3)[0]
 
     found = trials.find(futures, partial(trials.stand, past))
-    assert found == (0, 2, Ways.future, True)
+    assert found[:4] == (0, 2, Ways.future, True)
     # It stood there, and does so again after it has gone elsewhere.
     assert float((copies.pose().pos[2, 0, :2] - past[0, :2].float()).norm()) < 0.1
-    assert trials.find(futures, partial(trials.stand, past)) == found
+    assert trials.find(futures, partial(trials.stand, past))[:4] == found[:4]
     copies.close()

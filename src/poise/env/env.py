@@ -364,6 +364,17 @@ class ImitationEnv:
         self.controls.step(self._guard or self.backend, self.substeps)
         return self.renew(self.judge())
 
+    @one_thread()
+    def go(self, actions: Tensor) -> Tensor:
+        """One control step of which nothing is wanted but what is seen next, `(N, O)`: there are no
+        rewards, no ends and no new episodes, at a third of a step's time."""
+        self.drive(actions)
+        self.controls.step(self._guard or self.backend, self.substeps)
+        waited = self._held()
+        self.tick()
+        self.goal.advance(waited, self._held())
+        return self.observe()
+
     def drive(self, actions: Tensor) -> None:
         """The first part of a step: fills the drive; the physics is then the caller's to step."""
         goal = self.goal

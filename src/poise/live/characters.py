@@ -4,25 +4,18 @@ endless motion, and after a fall a recovery motion, after which it goes on with 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.generator_goal import IN_THE_WAY, SOME, cost_of
 from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.env.recovery.planner import way_to_stand
 from poise.env.recovery.recovering import RecoveryPhases
-from poise.live.people import Offset
 from poise.metrics import LOST
 from poise.motion.rotations import facing, heading_angle
-from poise.plan.rehearsal import FutureTrials
-from poise.synthesis.generator import Kinematic
 
 #: s in which one motion passes into another at least; m/s^2 with which the root speeds up at most, on
 #: average.
@@ -136,107 +129,6 @@ class RecoveryMotion:
         self._plan = self._frames = None
 
 
-#: Frames that wait at least; below it more are made.
-AHEAD = 30
-
-
-class EndlessCoords:
-    """Coordinates of a body at the control rate, without end.
-
-    Args:
-        generator: makes them.
-        seed: of its draws.
-        executor: makes them beside the loop; None makes them at once, as tests do.
-        trials: gives copies of the character in which futures are tried before one is taken, see
-            `plan.rehearsal`; they begin as the motion does, since where the character will be by then is
-            not known. None takes futures as they are made.
-    """
-
-    def __init__(
-        self,
-        generator: Kinematic,
-        seed: int = 0,
-        executor: Executor | None = None,
-        trials: Callable[[], FutureTrials] | None = None,
-    ):
-        self._generator, self._executor, self._trials = generator, executor, trials
-        self._rng = torch.Generator().manual_seed(seed)
-        self._past = generator.begin(1, self._rng)
-        self._frames = deque[np.ndarray]()
-        self._made: Future[Tensor] | None = None
-        self._last: np.ndarray | None = None
-        self._where = Offset()
-
-    def next(self, waits: bool = False, others: Sequence[np.ndarray] = ()) -> np.ndarray | None:
-        """The next frame `(7 + n)`; None before any was made.
-
-        Args:
-            waits: the character has lost it, and it waits for it.
-            others: `(m, 3)` m each, where the roots of other characters are in the next frames, as far
-                as that is known; it keeps away from them.
-        """
-        self._more(others)
-        if self._frames and not (waits and self._last is not None):
-            self._last = self._frames.popleft()
-        return None if self._last is None else self._where(self._last)
-
-    def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """Lets it go on so that the coordinates `seen (7 + n)` are where and face as `to` does."""
-        self._where.move(seen, to)
-
-    def coming(self) -> np.ndarray:
-        """`(m, 3)` m, where its root is in the next frames, as far as they are made."""
-        frames = [f for f in (self._last, *self._frames) if f is not None]
-        return self._where.points(np.array([f[:3] for f in frames]).reshape(-1, 3))
-
-    def _more(self, others: Sequence[np.ndarray]) -> None:
-        if self._made is not None and self._made.done():
-            made, self._made = self._made.result(), None
-            self._past = torch.cat((self._past, made), 1)[:, -self._generator.past :]
-            self._frames.extend(made[0].numpy())
-        if self._made is None and len(self._frames) < AHEAD:
-            there = [self._there(places) for places in others if len(places)]
-            if self._executor is not None:
-                self._made = self._executor.submit(self._make, there)
-            else:
-                self._made = Future()
-                self._made.set_result(self._make(there))
-
-    def _there(self, places: np.ndarray) -> Tensor:
-        """`(f, 2)` m, where another one is in the frames that are to be made, in the generator's world;
-        beyond what is known it goes on as it goes."""
-        index = len(self._frames) + np.arange(1, self._generator.future + 1)
-        last = len(places) - 1
-        before = max(0, last - AHEAD // 3)
-        step = (places[last] - places[before]) / max(1, last - before)
-        found = places[np.minimum(index, last)] + np.maximum(index - last, 0)[:, None] * step
-        return torch.from_numpy(self._where.back(found)[:, :2].copy())
-
-    def _make(self, others: Sequence[Tensor]) -> Tensor:
-        here, keeps = self._past[0, -1, :2], self._generator.future
-        near = any(float((o - here).norm(dim=-1).amin()) < IN_THE_WAY for o in others)
-        if near:
-            # The others may turn meanwhile: half of it is done before more is made.
-            keeps = -(-keeps // 2)
-        if self._trials is None:
-            return self._futures(SOME if near else 1, near, others)[None, 0, :keeps]
-        trials, drawn = self._trials(), list[Tensor]()
-
-        def futures(k: int) -> Tensor:
-            many = SOME if near else len(trials)
-            drawn.append(self._futures(many, near, others)[: len(trials), :keeps])
-            return drawn[k]
-
-        found = trials.find(futures, partial(trials.stand, self._past[0]))
-        return drawn[found.drawn][None, found.which, : found.frames]
-
-    def _futures(self, count: int, near: bool, others: Sequence[Tensor]) -> Tensor:
-        """`(count, f, 7 + n)`, those that keep away from the others first, where they are near."""
-        one = torch.zeros(1, dtype=torch.long)
-        made = self._generator.propose(self._past, self._rng, count, one, None if near else count)[0]
-        return made[cost_of(made[..., :2], None, others).argsort(stable=True)] if near else made
-
-
 #: What a character does.
 EASE, TRACKS, FALLS, RETURNS = "at ease", "tracks", "falls", "gets up"
 #: m that a standing person may be away for the character to walk there; m/s of one that stands.
@@ -314,6 +206,21 @@ class CharacterGoals:
         """`EASE`, `TRACKS`, `FALLS` or `RETURNS`."""
         now = (TRACKS, FALLS, RETURNS)[int(self._phases.doing)]
         return EASE if self._eases and now == TRACKS else now
+
+    @property
+    def comes(self) -> bool:
+        """Whether it is yet to come to its person's motion, or to come back to it."""
+        return self.doing in (FALLS, RETURNS) or self._passing.on
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it is on its person's motion, as that is."""
+        return self.doing == TRACKS and not (self._passing.on or self._lost or self.anew)
+
+    def passed(self, frame: Tensor) -> Tensor:
+        """One more frame of a motion that it goes on with, as it is."""
+        self._drift, self._person, self.last = frame[:2] - self.last[:2], frame.clone(), frame
+        return frame
 
     def begin(self, frame: Tensor) -> None:
         """The character was set down on a frame."""

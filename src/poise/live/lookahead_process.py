@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import queue
-import signal
-import threading
-from collections.abc import Mapping
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +13,13 @@ from torch import Tensor
 
 from poise.control import Compliance
 from poise.env import ImitationEnv
-from poise.env.env import Snapshot
 from poise.env.stream_goal import StreamGoal
 from poise.errors import PoiseError
 from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
+from poise.live.beside import Beside, SnapshotArrays
 from poise.plan import Lookahead, LookaheadConfig
 from poise.plan.lookahead import PAST, Choice
 
@@ -87,21 +82,17 @@ class AheadAtOnce:
 LEAD = 3
 #: By how much the other process comes after the loop, as `nice` counts.
 NICE = 5
-#: s that the other process has to end.
-ENDS_S = 2.0
 
 
 class _Asked(NamedTuple):
-    """A question to the other process; arrays, which cost little to hand over.
+    """A question to the other process.
 
     Attributes:
-        worlds, physics, goal: of the snapshot.
+        world: the character's snapshot.
         past, off_m, last, meanwhile: see `Lookahead.decide`.
     """
 
-    worlds: Mapping[str, np.ndarray]
-    physics: int
-    goal: Mapping[str, np.ndarray]
+    world: SnapshotArrays
     past: np.ndarray
     off_m: float
     last: np.ndarray
@@ -141,22 +132,15 @@ class AheadBeside:
         self._env: ImitationEnv | None = None
         self._worlds = dict[int, _LookingCharacter]()
         self.acts, self.decided = False, 0
-        context = get_context("spawn")
-        self._line, other = context.Pipe()
-        args = (other, replace(tracker, about={}), seed)
-        self._process = context.Process(target=_decide_all, args=args, daemon=True)
-        self._process.start()
-        other.close()
-        self._asks: queue.SimpleQueue[tuple[_LookingCharacter, _Asked] | None] = queue.SimpleQueue()
-        self._told: queue.SimpleQueue[tuple[_LookingCharacter, _Answer]] = queue.SimpleQueue()
-        self._waiting = False
-        self._thread = threading.Thread(target=self._carry, daemon=True)
-        self._thread.start()
+        args = replace(tracker, about={}), seed
+        self._beside = Beside[_Asked, _Answer](_decider, args, NICE)
+        # What is being decided, and for which character.
+        self._asked: tuple[_LookingCharacter, Future[_Answer]] | None = None
 
     @property
     def decides(self) -> bool:
         """True while an action is being decided; nothing else is asked meanwhile."""
-        return self._waiting and self._told.empty()
+        return self._asked is not None and not self._asked[1].done()
 
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
         """See `AheadAtOnce`. A question of before is not waited for."""
@@ -171,9 +155,9 @@ class AheadBeside:
                 hint="Call watch(env) first",
                 code="environment-missing",
             )
-        while not self._told.empty():
-            world, (offsets, *rest) = self._told.get()
-            self._waiting = False
+        if self._asked is not None and self._asked[1].done():
+            world, (offsets, *rest) = self._asked[0], self._asked[1].result()
+            self._asked = None
             self.decided += 1
             world.choice = Choice(torch.from_numpy(offsets), *rest)
             world.step, world.since = world.since or 0, None
@@ -205,7 +189,7 @@ class AheadBeside:
         """Hands a question over, where nothing is being decided and this character's turn has come."""
         env = self._env
         assert env is not None
-        if self._waiting or (world.choice is not None and world.step < QUICK.hold_steps):
+        if self._asked is not None or (world.choice is not None and world.step < QUICK.hold_steps):
             return
         if len(self._worlds) > 1 and world is not max(self._worlds.values(), key=lambda w: w.step):
             return
@@ -218,52 +202,22 @@ class AheadBeside:
         snapshot = env.snapshot(torch.tensor([i]))
         past = torch.stack(world.past) if world.past else pos[None][:0]
         off = float((pos - env.goal_pose().pos[i]).norm(dim=-1).mean())
-        arrays = {k: v.numpy() for k, v in snapshot.worlds.items()}
-        goal = {k: v.clone().numpy() for k, v in snapshot.goal.items()}
-        asked = _Asked(arrays, snapshot.physics, goal, past.numpy(), off, last.numpy(), ahead.numpy())
-        world.since, self._waiting = 0, True
-        self._asks.put((world, asked))
-
-    def _carry(self) -> None:
-        """Hands questions over and answers back, so that the loop waits for neither."""
-        try:
-            while (one := self._asks.get()) is not None:
-                self._line.send(one[1])
-                self._told.put((one[0], self._line.recv()))
-        except (EOFError, OSError):
-            # The other process has ended; the policy acts alone.
-            return
+        arrays = past.numpy(), off, last.numpy(), ahead.numpy()
+        world.since = 0
+        self._asked = world, self._beside.ask(_Asked(SnapshotArrays.of(snapshot), *arrays))
 
     def close(self) -> None:
         """See `AheadAtOnce`."""
-        self._asks.put(None)
-        self._line.close()
-        self._process.terminate()
-        self._process.join(ENDS_S)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join(ENDS_S)
-        self._thread.join(ENDS_S)
+        self._beside.close()
 
 
-def _decide_all(line: Connection, tracker: Tracker, seed: int) -> None:
-    """What the other process does until nobody asks any more."""
-    # Ctrl-C is for the loop, which ends this process.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    # The loop comes first, where there is not a core for each.
-    os.nice(NICE)
+def _decider(tracker: Tracker, seed: int) -> Callable[[_Asked], _Answer]:
+    """What decides in the other process."""
     lookahead = tries_of(tracker, QUICK, seed)
-    while True:
-        try:
-            asked: _Asked = line.recv()
-        except (EOFError, OSError):
-            return
-        snapshot = Snapshot(_tensors(asked.worlds), asked.physics, _tensors(asked.goal), None)
+
+    def decide(asked: _Asked) -> _Answer:
         last, meanwhile, past = (torch.from_numpy(x) for x in (asked.last, asked.meanwhile, asked.past))
-        made = lookahead.decide(snapshot, past, asked.off_m, last, meanwhile)
-        line.send((made.offsets.numpy(), made.smoothing, made.correction))
+        made = lookahead.decide(asked.world.snapshot(), past, asked.off_m, last, meanwhile)
+        return made.offsets.numpy(), made.smoothing, made.correction
 
-
-def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
-    return {k: torch.from_numpy(v) for k, v in arrays.items()}
+    return decide

@@ -41,10 +41,10 @@ class Offset:
     shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __call__(self, qpos: np.ndarray) -> np.ndarray:
-        """Coordinates `(7 + n)` there."""
+        """Coordinates `(..., 7 + n)` there."""
         out, turn = qpos.copy(), yaw_quat(self.yaw)
-        out[:3] = quat_rotate(turn, qpos[:3]) + self.shift
-        out[3:7] = quat_mul(turn, qpos[3:7])
+        out[..., :3] = quat_rotate(turn, qpos[..., :3]) + self.shift
+        out[..., 3:7] = quat_mul(turn, qpos[..., 3:7])
         return out
 
     def points(self, places: np.ndarray) -> np.ndarray:

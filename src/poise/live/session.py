@@ -103,7 +103,7 @@ class CommandQueue:
             self.aims.noise = command["noise"]
         if "lookahead" in command:
             most = min(command["lookahead"], self.world.count)
-            self.world.look_ahead(tuple(range(most if self.world.can_look_ahead else 0)))
+            self.aims.look_ahead(tuple(range(most if self.world.can_look_ahead else 0)))
 
 
 #: Packets by which it is known when they come; s after them at which a step begins; s by which one step
@@ -186,7 +186,7 @@ def figures(aims: Targets, inbox: Inbox, times: Times) -> dict[str, Any]:
     world, people = aims.world, aims.people
     return {
         **times.told(),
-        "buffer": people.delay_s, "noise": aims.noise, "lookahead": len(world.ahead_of),
+        "buffer": people.delay_s, "noise": aims.noise, "lookahead": len(world.wanted),
         "looked_ahead": round(world.looked / max(1, times.steps), 3),
         "resets": world.resets, "help_n": 0.0, "received": inbox.received,
         "refused": dict(inbox.refused), "crowded": inbox.crowded,

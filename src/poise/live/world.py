@@ -5,7 +5,7 @@ can be thrown at them. Compliance feels the hand that drags a body, and blows.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import NamedTuple
@@ -148,6 +148,7 @@ class LiveWorld:
         unwound: how often a fallen character's hinges were whole turns off.
         hurries: whether there is no time to look ahead; all act at once then.
         looked: control steps in which a character looked ahead.
+        wanted: characters that are to look ahead, and `ahead_of`, those of them that do.
         ahead: looks ahead for those that do; None before one does.
 
     Raises:
@@ -195,7 +196,7 @@ class LiveWorld:
         self.characters = [CharacterGoals(planner, spot, executor) for spot in spots]
         self.substeps, self.resets, self.steps, self.unwound = sim.substeps, 0, 0, 0
         self._range = torch.from_numpy(body.model.jnt_range[1:].T.copy()).to(self.rows.state.qpos)
-        self.lead, self._full = [1] * count, 1
+        self.lead, self._full = [1] * count, [1] * count
         self._read = [deque[Own | None](maxlen=READ) for _ in range(count)]
         self.hurries, self.looked = False, 0
         self._act = tracker.policy.act
@@ -208,9 +209,10 @@ class LiveWorld:
         self._set_down()
         self.look_ahead(lookahead)
 
-    def look_ahead(self, characters: tuple[int, ...]) -> None:
-        """Which characters look ahead; the others act at once."""
-        self.ahead_of = tuple(k for k in characters if 0 <= k < self.count)
+    def look_ahead(self, characters: tuple[int, ...], but: Collection[int] = ()) -> None:
+        """Which characters look ahead, `but` some; the others act at once."""
+        self.wanted = tuple(k for k in characters if 0 <= k < self.count)
+        self.ahead_of = tuple(k for k in self.wanted if k not in but)
         if self.ahead is None and self.ahead_of and self.can_look_ahead:
             self.ahead = (AheadBeside if self._beside else AheadAtOnce)(self.tracker, self._seed)
         if self.ahead is not None:
@@ -269,9 +271,15 @@ class LiveWorld:
             self._moves[character],
         )
 
-    def set_lead(self, lead: int) -> None:
-        """By how many frames goals are behind the newest ones."""
-        self.lead, self._full = [lead] * self.count, lead
+    def set_lead(self, character: int, lead: int, grows: bool = False) -> None:
+        """By how many frames a character's goal is behind the newest ones; it `grows` so bit by bit."""
+        self._full[character] = lead
+        if not grows:
+            self.lead[character] = lead
+
+    def wants(self, character: int) -> bool:
+        """Whether its goal is less behind than it is to be, so that it may be told one frame more."""
+        return self.lead[character] < self._full[character]
 
     def _lead_on(self) -> None:
         """A motion that begins from where a body is has nothing before it, and counts at once; what lies
@@ -281,20 +289,32 @@ class LiveWorld:
                 self.goal.clear(torch.tensor([k]))
                 self.lead[k] = 1
             elif character.still:
-                self.lead[k] = min(self._full, self.lead[k] + 1)
+                self.lead[k] = min(self._full[k], self.lead[k] + 1)
+            elif self.lead[k] > self._full[k] and self.steps % 2:
+                # What is known is done faster until it is behind no more.
+                self.lead[k] -= 1
 
     def step(
-        self, frames: Tensor, places: Tensor | None = None, own: Sequence[Own | None] = ()
+        self,
+        frames: Tensor,
+        places: Tensor | None = None,
+        own: Sequence[Own | None] = (),
+        more: Mapping[int, Tensor] | None = None,
     ) -> LiveStep:
         """One control step toward the frames `(K, 7 + n)`, the newest that the goals know.
 
-        places: see `StreamGoal.push`. own: the people's poses that the frames are.
+        places: see `StreamGoal.push`. own: the people's poses that the frames are. more: of some
+            characters the frame that follows, for those that `wants`.
         """
         env, goal = self.env, self.goal
         self._lead_on()
         goal.push(frames, places=places)
         for read, pose in zip(self._read, own or [None] * self.count, strict=True):
             read.append(pose)
+        for k, frame in (more or {}).items():
+            goal.push(frame, torch.tensor([k]))
+            self._read[k].append(None)
+            self.lead[k] += 1
         lead = torch.tensor(self.lead)
         goal.at.copy_((goal.count - 1 - lead).clamp_min(0))
         goal.aim(None, None)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
+from poise.env.env import ImitationEnv, Snapshot
 from poise.machine import one_thread
 from poise.metrics import has_lost
 
 if TYPE_CHECKING:
-    from poise.env.env import ImitationEnv
     from poise.env.generator_goal import Futures, GeneratorGoal
     from poise.env.recovery.recovering import Recovering
     from poise.env.task import Acts
@@ -32,12 +33,17 @@ class TriedFuture(NamedTuple):
     Attributes:
         drawn: how often futures were drawn before. which: of those of the last time. frames: of it that
             are to be taken. done: whether a copy does them.
+        path: `(f, 7 + n)`, what the copy does in the first f of them, up to `FutureTrials.sees` before the
+            last, from where on it did not know what follows. end: what it is then. Both None where it
+            does not do them.
     """
 
     drawn: int
     which: int
     frames: int
     done: bool
+    path: Tensor | None = None
+    end: Snapshot | None = None
 
 
 class FutureTrials:
@@ -48,11 +54,15 @@ class FutureTrials:
         copies: an environment of as many worlds as futures are tried: without ends and automatic
             restarts (`Imitation.bare`).
         tried: what the copies follow, a generator that makes no frames there.
+
+    Attributes:
+        sees: frames ahead of which the policy knows.
     """
 
     def __init__(self, policy: Acts, copies: ImitationEnv, tried: GeneratorGoal):
         self.policy, self.copies, self.tried = policy, copies, tried
-        self._every = torch.arange(copies.num_envs)
+        self._every, self._one = torch.arange(copies.num_envs), torch.zeros(1, dtype=torch.long)
+        self.sees = max(*copies.task.window, 1)
 
     def __len__(self) -> int:
         return len(self._every)
@@ -65,29 +75,66 @@ class FutureTrials:
         self.copies.age[:], self.copies.action[:] = 0, 0.0
 
     @one_thread()
-    def find(self, futures: Callable[[int], Tensor], begin: Callable[[], None]) -> TriedFuture:
+    def follow(self, here: Snapshot, frames: Tensor, at: int) -> Snapshot | None:
+        """What a copy is `sees` frames before the end of the frames that its character knows; None where
+        it has lost them by then.
+
+        Args:
+            here: the character as it is, of an environment with any kind of goal.
+            frames: `(k, 7 + n)`, with those before the one that it is at. at: which of them that is.
+        """
+        tried, copies, every = self.tried, self.copies, self._every
+        tried.begin_from(every, frames.expand(len(self), -1, -1))
+        tried.at[:] = at
+        tried.low[:] = here.worlds["goal/low"]
+        own = copies.snapshot(self._one)
+        goals = {f"goal/{name}" for name in tried.rows()}
+        worlds = {k: (own if k in goals else here).worlds[k] for k in own.worlds}
+        obs = copies.restore(Snapshot(worlds, here.physics, own.goal, None))
+        for _ in range(len(frames) - 1 - at - self.sees):
+            obs = copies.go(self.policy.act(obs))
+            if bool(has_lost(copies.here().pos, copies.goal_pose().pos)[0]):
+                return None
+        return copies.snapshot(self._one)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Every copy is what a snapshot of one holds."""
+        self.copies.restore(snapshot)
+
+    @one_thread()
+    def find(
+        self,
+        futures: Callable[[int], Tensor],
+        begin: Callable[[], None],
+        by_s: float | None = None,
+    ) -> TriedFuture:
         """Tries futures until one is done, and the first of those that were drawn together is taken. If
         none is in `ROUNDS`, the one that is followed for longest is, up to shortly before it is lost.
 
         Args:
             futures: draws some `(K, f, 7 + n)`, told how often they were drawn before.
             begin: sets the copies and their goals on where the character is.
+            by_s: by `time.time`, when no more are drawn that would not be done by then.
         """
         best: TriedFuture | None = None
+        begun = time.time()
         for k in range(ROUNDS):
+            spent = time.time() - begun
+            if best is not None and by_s is not None and begun + spent + spent / k > by_s:
+                break
             made = futures(k)
             begin()
-            which, frames, done = self._attempt(made)
-            if done:
-                return TriedFuture(k, which, made.shape[1], True)
-            if best is None or frames > best.frames:
-                best = TriedFuture(k, which, frames, False)
+            found = self._attempt(made)._replace(drawn=k)
+            if found.done:
+                return found
+            if best is None or found.frames > best.frames:
+                best = found
         assert best is not None
         return best._replace(frames=max(FEWEST, best.frames - SAFE))
 
-    def _attempt(self, made: Tensor) -> tuple[int, int, bool]:
-        """The index of the first of the futures `(K, f, 7 + n)` that is done, else of the one that is
-        followed for longest; so many of its frames; and whether it is done to its end."""
+    def _attempt(self, made: Tensor) -> TriedFuture:
+        """The first of the futures `(K, f, 7 + n)` that is done to its end, else the one that is
+        followed for longest."""
         copies, tried, every = self.copies, self.tried, self._every
         known = int(tried.count[0] - 1 - tried.at[0])
         tried.extend(every, made[every % len(made)])
@@ -96,17 +143,27 @@ class FutureTrials:
         # The last frame has no next one yet.
         steps = known + made.shape[1] - 1
         lasts, off = torch.full((len(every),), steps), torch.zeros(len(every))
+        paths, ends = list[Tensor](), None
         for k in range(steps):
-            obs = copies.step(self.policy.act(obs)).final_obs
-            pos, aim = copies.pose().pos, copies.goal_pose().pos
+            obs = copies.go(self.policy.act(obs))
+            pos, aim = copies.here().pos, copies.goal_pose().pos
             off = (pos - aim).norm(dim=-1).mean(-1).nan_to_num(torch.inf)
             lost = has_lost(pos, aim) | (off > NEAR_M)
             lasts = torch.where(lost & (lasts == steps), k, lasts)
             if bool((lasts < steps).all()):
                 break
+            paths.append(copies.backend.state.qpos.clone())
+            if k == steps - self.sees:
+                ends = copies.snapshot(every)
         steady = (lasts == steps) & (off <= END_M)
-        which = int(steady.float().argmax()) if bool(steady.any()) else int(lasts.argmax())
-        return which % len(made), int(lasts[which]) - known, bool(steady[which])
+        if not bool(steady.any()):
+            which = int(lasts.argmax())
+            return TriedFuture(0, which % len(made), int(lasts[which]) - known, False)
+        which = int(steady.float().argmax())
+        path = torch.stack(paths[known : steps - self.sees + 1])[:, which]
+        if ends is not None:
+            ends = ends.picked(self._every[which : which + 1])
+        return TriedFuture(0, which % len(made), made.shape[1], True, path, ends)
 
 
 class Rehearsal:
