@@ -83,8 +83,8 @@ class SegmentMade(NamedTuple):
 
     Attributes:
         frames: `(f, 7 + n)`. rng: state of the generator of its draws after it.
-        path: `(g, 7 + n)`, what the character is expected to do in the first g of them, in its world, and
-            `end`, what it is then; None where nothing is known.
+        path: `(g, 7 + n)`, what the character is expected to do in the first g of them, in its world.
+        end: what it is then. Both None where nothing is known.
     """
 
     frames: np.ndarray

@@ -33,9 +33,9 @@ class TriedFuture(NamedTuple):
     Attributes:
         drawn: how often futures were drawn before. which: of those of the last time. frames: of it that
             are to be taken. done: whether a copy does them.
-        path: `(f, 7 + n)`, what the copy does in the first f of them, up to `FutureTrials.sees` before the
-            last, from where on it did not know what follows. end: what it is then. Both None where it
-            does not do them.
+        path: `(f, 7 + n)`, what the copy does in the first f of them, up to `FutureTrials.sees` before
+            the last, from where on it did not know what follows. end: what it is then. Both None where
+            it does not do them.
     """
 
     drawn: int
