@@ -334,7 +334,7 @@ TABLES: dict[str, Table] = {
             Line("dream:futures tried, ten minutes each", "`poise dream`, policy, ten minutes each"),
             Line("dream:policy alone, ten minutes each", "the same, without trying futures"),
             Line("dream:lookahead", "`poise dream`, lookahead, three minutes"),
-            Line("live:4 dreaming, 2 cores", "four in real time, lookahead, two cores, three minutes"),
+            Line("live:4 dreaming, 2 cores", "four in real time, two cores, three minutes"),
             Line("dream:its library, as recorded", "the recordings that it learned"),
             Line(
                 "track:an hour of clips in a row, with recovery; policy alone",
