@@ -160,10 +160,13 @@ class FutureTrials:
             which = int(lasts.argmax())
             return TriedFuture(0, which % len(made), int(lasts[which]) - known, False)
         which = int(steady.float().argmax())
-        path = torch.stack(paths[known : steps - self.sees + 1])[:, which]
-        if ends is not None:
-            ends = ends.picked(self._every[which : which + 1])
-        return TriedFuture(0, which % len(made), made.shape[1], True, path, ends)
+        found = TriedFuture(0, which % len(made), made.shape[1], True)
+        path = paths[known : steps - self.sees + 1]
+        if ends is None or not path:
+            # Of so few frames nothing was done that does not hang on those that follow.
+            return found
+        end = ends.picked(self._every[which : which + 1])
+        return found._replace(path=torch.stack(path)[:, which], end=end)
 
 
 class Rehearsal:
