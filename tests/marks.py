@@ -24,6 +24,8 @@ MARKS = {
         "learn/test_parallel.py",
         "learn/test_trainer.py::test_kills",
         "live/test_record.py::test_kill_9",
+        "live/test_endless.py::test_a_process_beside",
+        "live/test_endless.py::test_another_process",
         "live/test_lookahead_process.py::test_the_loop_goes_on",
         "test_face.py::test_importing",
         "test_package.py::test_no_module_needs",

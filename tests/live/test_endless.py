@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import count
 
 import numpy as np
 import pytest
@@ -231,3 +236,30 @@ def test_a_process_beside_the_loop_answers_and_takes_nothing_away() -> None:
     # Arrays that look at what was handed over still do.
     assert numbers.data_ptr() == looks.ctypes.data and float(looks[70_000]) == 70_000.0
     beside.close()
+
+
+def test_another_process_goes_on_where_one_has_ended(tracker: Tracker) -> None:
+    before = multiprocessing.active_children()
+    with ThreadPoolExecutor(1) as pool:
+        live = Live(tracker, executor=pool, clock=lambda: 0.0, generator=generator_for(tracker))
+        live.aims.dream(0, True)
+        coords, steps = live.aims.endless[0], count()
+
+        def moves() -> bool:
+            """Whether motion comes, waited for as long as the busiest machine needs."""
+            coming, until = len(coords.coming()), time.monotonic() + 120
+            while len(coords.coming()) <= max(1, coming) and time.monotonic() < until:
+                live.step(next(steps) * STEP)
+                time.sleep(0.005)
+            return len(coords.coming()) > max(1, coming)
+
+        assert moves()
+        (process,) = (p for p in multiprocessing.active_children() if p not in before)
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGTERM)
+        process.join(30)
+        for _ in range(40):
+            live.step(next(steps) * STEP)
+        assert moves() and live.world.characters[0].doing == TRACKS
+        live.close()
+    assert multiprocessing.active_children() == before

@@ -55,6 +55,9 @@ class Beside(Generic[A, B]):
     Args:
         begin: makes there what answers a question, of `args`; both are handed over once.
         nice: by how much the process comes after the loop, as `nice` counts.
+
+    Attributes:
+        ended: whether the process has ended of itself; what was asked is cancelled then.
     """
 
     def __init__(self, begin: Callable[..., Callable[[A], B]], args: tuple[Any, ...], nice: int):
@@ -64,12 +67,12 @@ class Beside(Generic[A, B]):
         target = (self._other, begin, deepcopy(args), nice)
         self._process = context.Process(target=_answer_all, args=target, daemon=True)
         self._asks: queue.SimpleQueue[tuple[A, Future[B]] | None] = queue.SimpleQueue()
-        self._started = threading.Event()
+        self._started, self.ended = threading.Event(), False
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
     def ask(self, asked: A) -> Future[B]:
-        """The answer, once it is there; never, where the process has ended."""
+        """The answer, once it is there."""
         out: Future[B] = Future()
         self._asks.put((asked, out))
         return out
@@ -79,12 +82,15 @@ class Beside(Generic[A, B]):
         self._process.start()
         self._other.close()
         self._started.set()
-        try:
-            while (one := self._asks.get()) is not None:
-                self._line.send(one[0])
-                one[1].set_result(self._line.recv())
-        except (EOFError, OSError):
-            return
+        while (one := self._asks.get()) is not None:
+            try:
+                if not self.ended:
+                    self._line.send(one[0])
+                    one[1].set_result(self._line.recv())
+            except (EOFError, OSError):
+                self.ended = True
+            if self.ended:
+                one[1].cancel()
 
     def close(self) -> None:
         """Ends the process."""

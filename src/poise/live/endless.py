@@ -230,7 +230,9 @@ class EndlessCoords:
         self._made, self._end, self._stands = None, None, True
 
     def _more(self, others: Sequence[np.ndarray], here: CharacterHere | None) -> None:
-        if self._made is not None and self._made.done():
+        if self._made is not None and self._made.cancelled():
+            self._made = None
+        elif self._made is not None and self._made.done():
             (made, self._rng, path, self._end), self._made = self._made.result(), None
             self._past = np.concatenate((self._past, made))[-len(self._past) :]
             self._frames.extend(made)

@@ -155,7 +155,7 @@ class AheadBeside:
                 hint="Call watch(env) first",
                 code="environment-missing",
             )
-        if self._asked is not None and self._asked[1].done():
+        if self._asked is not None and self._asked[1].done() and not self._asked[1].cancelled():
             world, (offsets, *rest) = self._asked[0], self._asked[1].result()
             self._asked = None
             self.decided += 1

@@ -220,11 +220,15 @@ class Targets:
             g, ease = self.generator, self.world.characters[k].get_up.recovery_clips.ease.numpy()
             self.endless[k] = EndlessCoords(self._ask, ease, g.past, g.future, g.fps, seed)
             # Endless motion is known as far ahead as the policy sees.
-            self.world.set_lead(k, max(self.lead, *self.world.tracker.config.window), grows=True)
+            self.world.set_lead(k, max((self.lead, *self.world.tracker.config.window)), grows=True)
         self.look_ahead(self.world.wanted)
 
     def _ask(self, asked: SegmentAsked) -> Future[SegmentMade]:
-        """More endless motion: from a process of its own, or made at once."""
+        """More endless motion: from a process of its own, another one where that has ended, or made at
+        once."""
+        if isinstance(self._maker, Beside) and self._maker.ended:
+            self._maker.close()
+            self._maker = None
         if self._maker is None:
             assert self.generator is not None
             args = replace(self.world.tracker, about={}), self.generator

@@ -62,7 +62,7 @@ class FutureTrials:
     def __init__(self, policy: Acts, copies: ImitationEnv, tried: GeneratorGoal):
         self.policy, self.copies, self.tried = policy, copies, tried
         self._every, self._one = torch.arange(copies.num_envs), torch.zeros(1, dtype=torch.long)
-        self.sees = max(*copies.task.window, 1)
+        self.sees = max((1, *copies.task.window))
 
     def __len__(self) -> int:
         return len(self._every)

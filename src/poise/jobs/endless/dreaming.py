@@ -295,7 +295,7 @@ def trials_of(tracker: Tracker, generator: Kinematic, tries: int) -> FutureTrial
     """Copies of a policy's character alone, in which so many futures are tried at once."""
     task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
     copies = task.env(tries, None, False, 1, help_scale=0.0, guard=False)
-    lead = max(*tracker.config.window, 1) + 1
+    lead = max((1, *tracker.config.window)) + 1
     rate = tracker.config.sim.control_hz
     # The copies' own motion is replaced, and wishes are those of other worlds.
     begins = generator.wishing(0.0)
