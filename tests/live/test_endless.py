@@ -74,7 +74,7 @@ def test_it_stands_until_more_is_made_and_asks_in_time() -> None:
     ask = Asked()
     coords = EndlessCoords(ask, EASE, 5, 60, 30.0)
     assert [coords.next().tolist() for _ in range(3)] == [EASE.tolist()] * 3
-    # Where it stands nothing hurries.
+    # A character that stands is in no hurry.
     assert len(ask.all) == 1 and ask.all[0][0].spare_s == np.inf
     assert ask.all[0][0].past.tolist() == [EASE.tolist()] * 5
     ask.answer()
@@ -95,7 +95,7 @@ def test_it_stands_where_the_character_lost_it_and_begins_from_there() -> None:
     seen = [coords.next(waits=True) for _ in range(4)]
     assert all(np.allclose(q, [9.0, 9.0, *EASE[2:]]) for q in seen) and len(ask.all) == 1
     coords.next()
-    # What was made before does not count any more.
+    # Frames that were made before do not count any more.
     assert ask.all[1][0].spare_s == np.inf and np.allclose(ask.all[1][0].past[:, 0], last[0])
 
 
@@ -224,7 +224,7 @@ def test_several_that_dream_do_not_look_ahead(tracker: Tracker) -> None:
 
 
 def double(tensor: Tensor) -> Callable[[int], float]:
-    """What answers in the other process."""
+    """Answers in the other process."""
     return lambda asked: float(tensor[asked] * 2)
 
 

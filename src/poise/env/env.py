@@ -366,8 +366,8 @@ class ImitationEnv:
 
     @one_thread()
     def go(self, actions: Tensor) -> Tensor:
-        """One control step of which nothing is wanted but what is seen next, `(N, O)`: there are no
-        rewards, no ends and no new episodes, at a third of a step's time."""
+        """One control step without rewards, ends and new episodes; gives the observations `(N, O)`. It
+        takes a third less time than `step`."""
         self.drive(actions)
         self.controls.step(self._guard or self.backend, self.substeps)
         waited = self._held()

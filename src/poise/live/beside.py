@@ -63,7 +63,7 @@ class Beside(Generic[A, B]):
     def __init__(self, begin: Callable[..., Callable[[A], B]], args: tuple[Any, ...], nice: int):
         context = get_context("spawn")
         self._line, self._other = context.Pipe()
-        # What is handed over moves into shared memory, from under arrays that look at it here.
+        # Tensors that are handed over move into shared memory, from under arrays that look at them here.
         target = (self._other, begin, deepcopy(args), nice)
         self._process = context.Process(target=_answer_all, args=target, daemon=True)
         self._asks: queue.SimpleQueue[tuple[A, Future[B]] | None] = queue.SimpleQueue()
@@ -79,9 +79,14 @@ class Beside(Generic[A, B]):
 
     def _carry(self) -> None:
         """Begins the process, hands questions over and answers back; the loop waits for none of it."""
-        self._process.start()
-        self._other.close()
-        self._started.set()
+        try:
+            self._process.start()
+        except OSError:
+            # No process, and no answers.
+            self.ended = True
+        finally:
+            self._other.close()
+            self._started.set()
         while (one := self._asks.get()) is not None:
             try:
                 if not self.ended:
@@ -97,18 +102,19 @@ class Beside(Generic[A, B]):
         self._asks.put(None)
         self._started.wait()
         self._line.close()
-        self._process.terminate()
-        self._process.join(ENDS_S)
-        if self._process.is_alive():
-            self._process.kill()
+        if self._process.pid is not None:
+            self._process.terminate()
             self._process.join(ENDS_S)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join(ENDS_S)
         self._thread.join(ENDS_S)
 
 
 def _answer_all(
     line: Connection, begin: Callable[..., Callable[[Any], Any]], args: tuple[Any, ...], nice: int
 ) -> None:
-    """What the other process does until nobody asks any more."""
+    """The other process answers until nobody asks any more."""
     # Ctrl-C is for the loop, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)

@@ -55,7 +55,7 @@ class CharacterHere(NamedTuple):
 
 
 class SegmentAsked(NamedTuple):
-    """What more motion is made of.
+    """A question for more motion.
 
     Attributes:
         past: `(p, 7 + n)` frames that it follows.
@@ -107,8 +107,8 @@ class SegmentMaker:
         self._took = 0.0
 
     def __call__(self, asked: SegmentAsked) -> SegmentMade:
-        """One segment. Where it would come too late if it were tried, the first future is taken as it
-        is made, half of it."""
+        """One segment. If it would come too late after a trial, it is the first half of the first
+        future, untried."""
         begun, trials, past = time.time(), self.trials, torch.from_numpy(asked.past)
         rng = torch.Generator()
         rng.set_state(torch.from_numpy(asked.rng))
@@ -125,7 +125,7 @@ class SegmentMaker:
             return made
 
         if asked.by_s is not None and begun + self._took > asked.by_s:
-            # The next one is as late at most.
+            # One slow trial is not to keep all later futures from being tried.
             self._took *= 0.9
             return SegmentMade(draw()[0, :half].numpy().copy(), rng.get_state().numpy())
         there, ahead = torch.from_numpy(asked.where(asked.past)), None
@@ -180,7 +180,7 @@ class EndlessCoords:
         # Frames that wait, and what the character is expected to do in them.
         self._frames, self._paths = deque[np.ndarray](), deque[np.ndarray | None]()
         self.given = deque[np.ndarray | None](maxlen=GIVEN)
-        # What it is shortly before the last frame that waits.
+        # The character as it is to be shortly before the last frame that waits.
         self._end: SnapshotArrays | None = None
         self._made: Future[SegmentMade] | None = None
         self._last, self._where, self._waits = ease, Offset(), False

@@ -134,7 +134,7 @@ class AheadBeside:
         self.acts, self.decided = False, 0
         args = replace(tracker, about={}), seed
         self._beside = Beside[_Asked, _Answer](_decider, args, NICE)
-        # What is being decided, and for which character.
+        # The question that is open, and its character.
         self._asked: tuple[_LookingCharacter, Future[_Answer]] | None = None
 
     @property
@@ -212,7 +212,7 @@ class AheadBeside:
 
 
 def _decider(tracker: Tracker, seed: int) -> Callable[[_Asked], _Answer]:
-    """What decides in the other process."""
+    """Decides in the other process."""
     lookahead = tries_of(tracker, QUICK, seed)
 
     def decide(asked: _Asked) -> _Answer:

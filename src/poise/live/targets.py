@@ -241,8 +241,8 @@ class Targets:
         return made
 
     def look_ahead(self, characters: tuple[int, ...]) -> None:
-        """Which characters look ahead. Several on endless motion do not: their futures are tried with
-        the policy alone, and that takes the time."""
+        """Lets characters look ahead. Several on endless motion do not: their futures are tried with the
+        policy alone, and that takes the time."""
         self.world.look_ahead(characters, self.endless if len(self.endless) > 1 else ())
 
     def close(self) -> None:

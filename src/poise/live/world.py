@@ -210,7 +210,7 @@ class LiveWorld:
         self.look_ahead(lookahead)
 
     def look_ahead(self, characters: tuple[int, ...], but: Collection[int] = ()) -> None:
-        """Which characters look ahead, `but` some; the others act at once."""
+        """Lets characters look ahead, `but` some; the others act at once."""
         self.wanted = tuple(k for k in characters if 0 <= k < self.count)
         self.ahead_of = tuple(k for k in self.wanted if k not in but)
         if self.ahead is None and self.ahead_of and self.can_look_ahead:
@@ -291,7 +291,7 @@ class LiveWorld:
             elif character.still:
                 self.lead[k] = min(self._full[k], self.lead[k] + 1)
             elif self.lead[k] > self._full[k] and self.steps % 2:
-                # What is known is done faster until it is behind no more.
+                # Known frames go by faster until the goal is behind no more.
                 self.lead[k] -= 1
 
     def step(

@@ -76,7 +76,7 @@ class FutureTrials:
 
     @one_thread()
     def follow(self, here: Snapshot, frames: Tensor, at: int) -> Snapshot | None:
-        """What a copy is `sees` frames before the end of the frames that its character knows; None where
+        """A copy as it is `sees` frames before the end of the frames that its character knows; None if
         it has lost them by then.
 
         Args:
