@@ -333,7 +333,7 @@ TABLES: dict[str, Table] = {
         (
             Line("dream:futures tried, ten minutes each", "`poise dream`, policy, ten minutes each"),
             Line("dream:policy alone, ten minutes each", "the same, without trying futures"),
-            Line("dream:lookahead", "`poise dream`, lookahead, three minutes"),
+            Line("dream:lookahead", "`poise dream`, lookahead, ten minutes each"),
             Line("live:4 dreaming, 2 cores", "four in real time, two cores, three minutes"),
             Line("dream:its library, as recorded", "the recordings that it learned"),
             Line(

@@ -299,7 +299,7 @@ def together(places: Places, unit: str, name: str) -> Any:
 
 def ahead(places: Places, unit: str) -> Any:
     """A rollout that looks ahead."""
-    seconds, how = (1.0, {"lookahead": SMALL}) if places.smoke else (60.0, {})
+    seconds, how = (1.0, {"lookahead": SMALL}) if places.smoke else (600.0, {})
     tracker, model, _ = loaded()
     done = dream(seconds, model, tracker, seed=int(unit.removeprefix("seed ")), threads=1, **how)
     one = done.characters[0]
@@ -447,12 +447,12 @@ PARTS = {
         for name, (_, count, seconds, hours) in ROLLOUTS.items()
     },
     "lookahead": Part(
-        "rollouts of 60 s that look ahead",
-        lambda p: [f"seed {k}" for k in range(1 if p.smoke else 3)],
+        "rollouts of 600 s that look ahead",
+        lambda p: [f"seed {k}" for k in range(1 if p.smoke else 6)],
         ahead,
         partial(rollout_rows, name="lookahead"),
         _SHIPS,
-        hours=0.6,
+        hours=2.0,
         needs=(),
     ),
     "steering": Part(
