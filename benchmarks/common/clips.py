@@ -79,6 +79,13 @@ SETS = {
         ClipSet("library", "recordings and their retimed copies, learned", "known"),
         ClipSet("copies", "mirrored and backwards copies, learned", "known"),
         ClipSet(
+            "acrobatics",
+            "flips, rolls, cartwheels, spins and subject 90's acrobatics, learned",
+            "known",
+            only=("_backflip", "_cartwheel", "_roll", "_sideflip", "_spin", "-90_"),
+        ),
+        ClipSet("subject 49", "CMU subject 49, learned", "known", only=("-49_",)),
+        ClipSet(
             "salsa",
             "salsa, partners of dancers that were learned",
             "validation",
@@ -214,8 +221,9 @@ def library(places: Places, name: str) -> dict[str, Clip]:
     )
     out = {}
     for c in found:
-        made = c.name.endswith((MIRRORED, IS_BACKWARDS))
-        if made == (name == "copies") and not matches(HELD_OUT, c.name, subject_of(c.name)):
+        made, words = c.name.endswith((MIRRORED, IS_BACKWARDS)), SETS[name].only
+        wanted = made == (name == "copies") and (not words or _holds(c.name, words))
+        if wanted and not matches(HELD_OUT, c.name, subject_of(c.name)):
             out[c.name] = c
     return out
 

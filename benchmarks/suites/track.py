@@ -77,23 +77,30 @@ def episodes_of(places: Places, unit: str, of_set: str, method: str, trials: tup
     return {"episodes": found, "refused": refused}
 
 
-def set_rows(places: Places, raws: Raws, name: str, method: str) -> Iterator[Figure]:
-    """Figures of a set."""
+def set_rows(
+    places: Places, raws: Raws, name: str, method: str, listed: bool = False
+) -> Iterator[Figure]:
+    """Figures of a set; listed: and whether each of its clips is done."""
     subject = f"{SETS[name].title}; {method}"
     rows = [e for raw in raws.values() for e in raw["episodes"]]
     yield from figures(subject, rows)
     refused = sum(len(raw["refused"]) for raw in raws.values())
     yield Figure(subject, "refused", refused, len(rows) + refused)
+    if listed:
+        for e in (e for e in rows if not e["trial"]):
+            yield Figure(f"{e['clip']}; {method}", "done", float(e["won"]["phc"]), 1)
 
 
-def set_part(name: str, method: str, trials: tuple[int, ...], hours: float) -> Part:
+def set_part(
+    name: str, method: str, trials: tuple[int, ...], hours: float, listed: bool = False
+) -> Part:
     """The part of one set and method."""
     needs = ("data",) if SETS[name].pattern else ("library",)
     return Part(
         f"{SETS[name].title}, {SETS[name].learned}",
         partial(units, name=name),
         partial(episodes_of, of_set=name, method=method, trials=trials),
-        partial(set_rows, name=name, method=method),
+        partial(set_rows, name=name, method=method, listed=listed),
         (METHODS[method][0],),
         hours=hours,
         needs=needs,
@@ -252,6 +259,8 @@ PARTS = {
     "library, nothing": set_part("library", "nothing (action 0)", EXACT, 0.3),
     "copies, policy": set_part("copies", "policy alone", EXACT, 0.4),
     "copies, keypoints": set_part("copies", "policy of keypoints alone", EXACT, 0.4),
+    "acrobatics, policy": set_part("acrobatics", "policy alone", EXACT, 0.05, listed=True),
+    "subject 49, policy": set_part("subject 49", "policy alone", EXACT, 0.05),
     "estimators": Part(
         "files of real pose estimators",
         lambda p: names_of(p, "estimators"),
