@@ -237,6 +237,25 @@ def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
                 )
 
 
+#: Levels of the paper and above, which let hinges leave their ranges (Sec. 5.2).
+FAR_LEVELS = (0.04, 0.12, 0.2, 0.3, 0.4)
+
+
+def ranges(places: Places, unit: str) -> Any:
+    """The same throws where nothing keeps the goal's hinges in their ranges."""
+    levels, count = (FAR_LEVELS[:1], 2) if places.smoke else (FAR_LEVELS, 100)
+    found = throws(policy(), Compliance(), levels, count, threads=1, within=False)
+    return {"levels": list(levels), "outside": [row[np.isfinite(row)].tolist() for row in found.outside]}
+
+
+def range_rows(places: Places, raws: Raws) -> Iterator[Figure]:
+    """Shares of the frames after the blow, by level."""
+    for unit, raw in raws.items():
+        for level, shares in zip(raw["levels"], raw["outside"], strict=True):
+            subject, middle = f"{unit}, level {level:g}", statistics.fmean(shares)
+            yield Figure(subject, "outside", middle, len(shares), interval(shares, "outside"))
+
+
 # --- scenes ---------------------------------------------------------------------------------------
 
 Case = tuple[PlayScene, tuple[str, ...], float, int]
@@ -467,6 +486,15 @@ PARTS = {
     ),
     "throws": Part(
         "throws at a standing character", throw_units, thrown, throw_rows, _SHIPS, hours=1.5, needs=()
+    ),
+    "ranges": Part(
+        "throws at levels that the hinges' ranges do not hold back",
+        lambda _: ["throws, no range held"],
+        ranges,
+        range_rows,
+        _SHIPS,
+        hours=0.1,
+        needs=(),
     ),
     **{
         name: Part(

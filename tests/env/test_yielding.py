@@ -187,7 +187,12 @@ def test_the_range_of_motion_holds_by_itself(task: Imitation, given: Compliance 
         hinges = env.backend.drive.ctrl
         assert (hinges <= high + 1e-9).all() and (hinges >= low - 1e-9).all()
         lowered |= bool((event.share < 1.0).any())
-    assert lowered
+    assert lowered and not event.outside.any()
+    # Where nothing holds it, the goal goes on beyond.
+    event.within = False
+    for _ in range(10):
+        env.step(still(env))
+    assert event.outside.any()
     env.close()
 
 

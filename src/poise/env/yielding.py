@@ -154,6 +154,9 @@ class Yielding(Event):
         level: `(N,)` float64, the dial: the level of compliance, or N/m of a commanded stiffness; may be
             changed at any time by `turn`.
         share: `(N,)` of the last physics step's displacement that the hinges' ranges let through.
+        within: whether u keeps the goal's hinges in their ranges (Sec. 5.2 of the paper); a measurement
+            of what they would do turns it off.
+        outside: `(N,)` bool, where nothing keeps them, whether the last u took one out of its range.
     """
 
     def __init__(
@@ -191,7 +194,8 @@ class Yielding(Event):
         n = backend.num_envs
         dial = given.level if isinstance(given, Compliance) else given.newtons_per_metre
         self.level = torch.full((n,), dial, dtype=torch.float64, device=here)
-        self.share = torch.ones_like(self.level)
+        self.share, self.within = torch.ones_like(self.level), True
+        self.outside = torch.zeros_like(self.level, dtype=torch.bool)
         scheduled = given.schedule if isinstance(given, Stiffness) else ()
         self._schedule = torch.tensor([k for k, _ in scheduled], device=here)
         self._levels = torch.tensor([dial, *(k for _, k in scheduled)]).to(self.level)
@@ -301,8 +305,11 @@ class Yielding(Event):
             on = pushed.unsqueeze(1)
             u.copy_(torch.where(on, moved, back_u))
             rate.copy_(torch.where(on, speed, back_rate))
-        # Where the goal has moved on, what it leaves to its hinges' ranges has changed.
-        u[:, 6:] = torch.maximum(torch.minimum(u[:, 6:], self._most), self._least)
+        if self.within:
+            # Where the goal has moved on, what it leaves to its hinges' ranges has changed.
+            u[:, 6:] = torch.maximum(torch.minimum(u[:, 6:], self._most), self._least)
+        else:
+            self.outside = ((u[:, 6:] < self._least) | (u[:, 6:] > self._most)).any(1)
 
     def _pushed(self, felt: Sequence[Felt], acts: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """u and u' after a physics step in which forces act."""
@@ -331,7 +338,7 @@ class Yielding(Event):
             soft = softening(jacobian, force, self.level, self._kp, series)
             soft = -soft if given.hindsight else soft
             aim = moving(jacobian, force * (soft * on).unsqueeze(-1), self._weights).sum(1)
-            self.share = room(aim[:, 6:], self._least, self._most)
+            self.share = self._room(aim[:, 6:], self._least, self._most)
             # u' = (u* - u) / lag, exactly.
             left = float(np.exp(-h / given.lag_s))
             moved = torch.lerp(aim * self.share.unsqueeze(1), u, left)
@@ -343,9 +350,13 @@ class Yielding(Event):
         velocity = velocity * on.unsqueeze(-1)
         speed = compliant_rate(jacobian, velocity, self.level, self._weights, given, self._shares)
         left_low, left_high = self._least - u[:, 6:], self._most - u[:, 6:]
-        self.share = room(h * speed[:, 6:], left_low, left_high)
+        self.share = self._room(h * speed[:, 6:], left_low, left_high)
         speed = speed * self.share.unsqueeze(1)
         return u + h * speed, speed
+
+    def _room(self, step: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """`(N,)` the share of a displacement that the ranges let through."""
+        return room(step, low, high) if self.within else torch.ones_like(step[:, 0])
 
     def _against(self, body: Tensor, point: Tensor, jacobian: Tensor) -> Tensor:
         """x' `(N, K, 3)`: how fast points of the characters move against those of their references."""

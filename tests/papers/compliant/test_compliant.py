@@ -45,7 +45,7 @@ def test_the_same_throws_at_each_level(tracker: Tracker) -> None:
     assert (found.impulse[0] > 1.0).all() and (found.impulse[0] < 10.0).all()
     assert (found.peak > found.impulse).all() and (found.torque > 1.0).all()
     assert not found.moved[0].any() and (found.moved[1] > 0.0).all()
-    assert not found.fell.any()
+    assert not found.fell.any() and not found.outside.any()
     again = throws(tracker, Compliance(), (0.0,), 5, threads=1)
     np.testing.assert_array_equal(again.impulse, found.impulse[:1])
 

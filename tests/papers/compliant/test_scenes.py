@@ -137,12 +137,19 @@ def test_forces_are_to_stay_small_after_a_blow() -> None:
         torque = torch.tensor([[-4.0, 0.0], [0.0, 0.0], [8.0, -8.0]])
 
         def source(self, name: str) -> Tensor:
-            told = {"load": [50.0, 0.0, 0.0], "since": [0.0, 0.4, 0.6]}
+            told = {
+                "load": [50.0, 0.0, 0.0],
+                "since": [0.0, 0.4, 0.6],
+                "compliance/level": [0.05, 0.2, 0.2],
+            }
             return torch.tensor(told[name])
 
     paid = small_forces(Seen(), newtons=100.0, newton_metres=20.0)  # type: ignore[arg-type]
-    expected = [0.5 * (math.exp(-0.5) + math.exp(-0.1)), 1.0, 1.0]
-    torch.testing.assert_close(paid, torch.tensor(expected))
+    expected = 0.5 * (math.exp(-0.5) + math.exp(-0.1))
+    torch.testing.assert_close(paid, torch.tensor([expected, 1.0, 1.0]))
+    # A quarter of the level pays a quarter of what is lacking.
+    paid = small_forces(Seen(), newtons=100.0, newton_metres=20.0, most=0.2)  # type: ignore[arg-type]
+    torch.testing.assert_close(paid, torch.tensor([0.75 + 0.25 * expected, 1.0, 1.0]))
 
 
 def test_a_hand_that_keeps_away_from_the_knob_ends_the_episode(task: Imitation) -> None:

@@ -173,6 +173,8 @@ class Thrown:
         peak: N, the greatest contact force of a physics step.
         torque: N m, mean over the hinges and over 0.5 s of the size of what the servos exert.
         moved: m, how far the goal's pelvis and hinged bodies gave way at most, mean of the bodies.
+        outside: share of the frames from the first contact on in which what gave way took a hinge of the
+            goal out of its range.
         fell: whether the character fell.
     """
 
@@ -181,6 +183,7 @@ class Thrown:
     peak: np.ndarray
     torque: np.ndarray
     moved: np.ndarray
+    outside: np.ndarray
     fell: np.ndarray
 
 
@@ -194,6 +197,7 @@ def throws(
     threads: int = 0,
     show: Callable[[int, int], None] | None = None,
     learned: LearnedOnTop | None = None,
+    within: bool = True,
 ) -> Thrown:
     """The same throws at each level, by the policy alone (Deep Compliant Control, Sec. 5.2 and Fig. 4).
 
@@ -206,6 +210,7 @@ def throws(
         rate_hz: of the physics; None for the policy's own.
         show: is told how many levels of how many are done.
         learned: what was learned on top of the policy, which must have learned levels that are drawn.
+        within: whether the goal's hinges stay in their ranges, see `Yielding`.
 
     Raises:
         PoiseError: a level outside of 0 to 1, or a policy that knows no pose at ease.
@@ -225,7 +230,7 @@ def throws(
     task = replace(task, task=own, props=stage.props, touches=stage.touches)
     found = list[tuple[np.ndarray, ...]]()
     for k, level in enumerate(levels):
-        found.append(_at(tracker, task, count, threads, level, learned))
+        found.append(_at(tracker, task, count, threads, level, learned, within))
         if show is not None:
             show(k + 1, len(levels))
     columns = (np.stack(c) for c in zip(*found, strict=True))
@@ -239,6 +244,7 @@ def _at(
     threads: int,
     level: float,
     learned: LearnedOnTop | None,
+    within: bool,
 ) -> tuple[np.ndarray, ...]:
     """The rows `(M,)` of `Thrown` at one level."""
     env = task.env(count, None, False, threads, help_scale=0.0, guard=False)
@@ -247,11 +253,14 @@ def _at(
     assert yields is not None and part is not None and isinstance(goal, DisplacedGoal)
     throw, policy = part.events[1], tracker.policy if learned is None else learned.over(tracker, env)
     yields.turn(level)
+    yields.within = within
     zero = torch.zeros(count, dtype=torch.long)
     obs, rate = env.reset_to(zero, zero), task.reference.rate_hz
     height = env.pose().pos[:, 0, 2].clone()
     impulse = torch.zeros(count, 3, dtype=torch.float64)
-    peak, torque, counted, moved = (torch.zeros(count, dtype=torch.float64) for _ in range(4))
+    peak, torque, counted, moved, out, after = (
+        torch.zeros(count, dtype=torch.float64) for _ in range(6)
+    )
     left = torch.full((count,), round(COUNTS_S * rate))
     hit, fell = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
     # One throw: the next one would be due after the wait again.
@@ -272,10 +281,12 @@ def _at(
         counted += now
         way = (env.goal_pose().pos - goal.layout.unpacked(goal.goal.now()).pos).norm(dim=-1).mean(1)
         moved = torch.maximum(moved, way.double())
+        after += hit
+        out += hit & yields.outside
         fell |= env.pose().pos[:, 0, 2] < FALLEN * height
     env.close()
     missed = torch.where(hit, 1.0, torch.nan).double()
-    rows = impulse.norm(dim=-1), peak, torque / counted.clamp_min(1.0), moved
+    rows = impulse.norm(dim=-1), peak, torque / counted.clamp_min(1.0), moved, out / after
     return (*((r * missed).numpy() for r in rows), fell.numpy())
 
 

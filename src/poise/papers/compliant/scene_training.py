@@ -14,7 +14,7 @@
 The paper's controller learns all of a motion from nothing by an adversarial reward, see
 `imitation_controller`. Here the policy that tracks any motion follows the displaced goal, and the policy
 on top learns what the scene's task asks for beside that: where nothing is to be done, that forces and
-torques stay small after a blow (`scenes.stage.eased`).
+torques stay small after a blow (`scenes.stage.eased`), which pays by the level where levels are drawn.
 
 run/
     compliant.json          the settings
@@ -384,7 +384,8 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
     """The task of the policy below, with what the scene adds to it (Eq. 10)."""
     imitation = tuple(replace(r, weight=config.imitation_weight * r.weight) for r in base.rewards)
     share = config.task_weight / sum(r.weight for r in stage.rewards)
-    own = tuple(replace(r, weight=share * r.weight) for r in stage.rewards)
+    most = {} if config.drawn is None or config.scene in TASKS else {"most": LEVELS[1]}
+    own = tuple(replace(r, weight=share * r.weight, params={**r.params, **most}) for r in stage.rewards)
     dones: tuple[DoneTerm, ...] = (*base.dones, *stage.dones)
     gamma, stands = config.ppo.gamma, not config.clip
     off = (StartsOff(config.play().starts.times(config.spread)),) if config.spread else ()
@@ -501,12 +502,16 @@ def begin(folder: Path, config: Compliant, below: str) -> Compliant:
     return config
 
 
-def at_rate(scene: PlayScene, tracker: Tracker) -> Tracker:
-    """The policy at the rate of a scene's physics, where that is above its own."""
-    own = tracker.config.sim
-    if scene.rate_hz is None or scene.rate_hz <= own.rate_hz:
+#: Hz, at most, of the physics while a scene is learned: five times the samples of its own rate's.
+LEARNS_HZ = 120.0
+
+
+def at_rate(scene: PlayScene, tracker: Tracker, most: float = math.inf) -> Tracker:
+    """The policy at the rate of a scene's physics, up to `most` Hz, where that is above its own."""
+    own, rate = tracker.config.sim, min(scene.rate_hz or 0.0, most)
+    if rate <= own.rate_hz:
         return tracker
-    return replace(tracker, config=replace(tracker.config, sim=replace(own, rate_hz=scene.rate_hz)))
+    return replace(tracker, config=replace(tracker.config, sim=replace(own, rate_hz=rate)))
 
 
 def set_up(
@@ -526,7 +531,7 @@ def scene_task(config: Compliant, tracker: Tracker) -> Imitation:
     """The scene as a task of the tracker's body, with all that a policy on top sees and is paid."""
     scene = config.play()
     clip = read_clip(config.clip) if config.clip else None
-    made, stage = set_up(scene, at_rate(scene, tracker), config.seconds + 0.1, clip)
+    made, stage = set_up(scene, at_rate(scene, tracker, LEARNS_HZ), config.seconds + 0.1, clip)
     return replace(made, task=task(made.task, stage, config, made.reference.rate_hz))
 
 

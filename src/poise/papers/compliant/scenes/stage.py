@@ -114,12 +114,21 @@ def felt_seen(frame: Frame, newtons: float) -> Tensor:
     return torch.stack((frame.source("load") / newtons, since), 1)
 
 
-def small_forces(frame: Frame, newtons: float, newton_metres: float) -> Tensor:
-    """The reward `(N,)` of `eased`."""
+def small_forces(
+    frame: Frame, newtons: float, newton_metres: float, most: float | None = None
+) -> Tensor:
+    """The reward `(N,)` of `eased`.
+
+    most: the level of compliance at which all of it is paid; below it a part, and at level 0 nothing is
+        paid for giving way. None pays all of it at any level.
+    """
     assert frame.torque is not None
     force = torch.exp(-frame.source("load") / newtons)
     torque = torch.exp(-frame.torque.abs().mean(1) / newton_metres)
-    return torch.where(frame.source("since") <= AFTER_S, 0.5 * (force + torque), 1.0)
+    lacks = 1.0 - 0.5 * (force + torque)
+    if most is not None:
+        lacks = (frame.source("compliance/level") / most).clamp(0.0, 1.0).to(lacks) * lacks
+    return torch.where(frame.source("since") <= AFTER_S, 1.0 - lacks, 1.0)
 
 
 class PlayScene(Protocol):
