@@ -80,7 +80,10 @@ def test_an_opponent_out_of_reach_moves_as_if_it_were_alone(tracker: Tracker, ta
     assert 0.6 * APART_M < float(rival.reference.qpos[0, 0]) < 1.4 * APART_M
     given = Compliance(0.1)
     own = replace(
-        task.task, events=(*stage.events, opposing(far, tracker, given)), compliance=given, dones=()
+        task.task,
+        events=(*stage.events, opposing(far, tracker.policy, given)),
+        compliance=given,
+        dones=(),
     )
     made = replace(task, task=own, props=stage.props, touches=stage.touches)
     env = made.env(2, threads=1, auto_reset=False, help_scale=0.0, guard=False)

@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -31,6 +32,7 @@ from poise.papers.compliant.scene_training import (
     shipped,
     train,
 )
+from poise.papers.compliant.scenes import Chicken
 from poise.papers.compliant.scenes.ball import FictionalForces
 from poise.papers.compliant.scenes.body_scenes import Bounce
 from poise.papers.compliant.watch import part_of
@@ -191,6 +193,19 @@ def test_what_learned_levels_is_played_at_each(tracker: Tracker, tmp_path: Path)
         one.played(Compliance(0.16))
     with refused("settings-conflict", says="a motion of its own"):
         replace(config, scene="door", clip="walk.bvh")
+
+
+def test_an_opponent_acts_with_what_was_learned_too(tracker: Tracker, tmp_path: Path) -> None:
+    config = replace(TINY, scene="chicken", num_envs=2)
+    train(config, tracker, tmp_path / "run", Until(iterations=1), threads=1, tensorboard=False)
+    run, scene = open_learned(tmp_path / "run", tracker), Chicken(against="rival")
+    both, named, alone = (
+        play(scene, tracker, None, Compliance(0.1), 1, 0.5, 1, learned=learned, rival=rival)
+        for learned, rival in ((run, None), (run, run), (None, None))
+    )
+    ways = [np.stack([m.pos for m in played.movers]) for played in (both, named, alone)]
+    np.testing.assert_array_equal(ways[0], ways[1])
+    assert ways[0].shape == ways[2].shape and (ways[0] != ways[2]).any()
 
 
 def test_rods_and_doors_are_drawn_for_each_episode(tracker: Tracker) -> None:

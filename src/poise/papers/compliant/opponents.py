@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -217,21 +217,35 @@ def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[Sc
     task = replace(
         task,
         task=replace(
-            task.task, events=(InScene(felt=tuple(t.name for t in felt)),), dones=(), help_by="all"
+            task.task,
+            events=(InScene(metered=("hit",), felt=tuple(t.name for t in felt)),),
+            dones=(),
+            help_by="all",
         ),
     )
     rival = Character(task.humanoid, RIVAL, soft=True)
     return stage._replace(props=(rival,), touches=(*stage.touches, *felt)), task
 
 
-def opposing(task: Imitation, tracker: Tracker, given: Compliance | Stiffness | None) -> Opponent:
-    """The opponent as an event, which gives way as the player does."""
+def opposing(
+    task: Imitation,
+    policy: Acts,
+    given: Compliance | Stiffness | None,
+    begin: Callable[[ImitationEnv], Any] | None = None,
+) -> Opponent:
+    """The opponent as an event, which gives way as the player does.
+
+    begin: is told the opponent's environment before the policy acts in it.
+    """
     own = replace(task, task=replace(task.task, compliance=given))
 
     def make(rows: Backend) -> ImitationEnv:
-        return own.env(auto_reset=False, help_scale=0.0, guard=False, backend=rows)
+        env = own.env(auto_reset=False, help_scale=0.0, guard=False, backend=rows)
+        if begin is not None:
+            begin(env)
+        return env
 
-    return Opponent(RIVAL, make, tracker.policy)
+    return Opponent(RIVAL, make, policy)
 
 
 class Undisplaced(NamedTuple):

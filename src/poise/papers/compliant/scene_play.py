@@ -32,9 +32,10 @@ from poise.jobs.track.controllers import look_ahead
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.papers.compliant.motions import motion_of
-from poise.papers.compliant.opponents import opposing, rival_stage
+from poise.papers.compliant.opponents import Opponent, opposing, rival_stage
 from poise.papers.compliant.scene_training import LearnedOnTop, Topped, at_rate, seen, set_up
-from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene
+from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene, SceneSetup
+from poise.papers.compliant.scenes.stage import feels
 from poise.papers.compliant.watch import Watch, meter_of
 from poise.plan import LookaheadConfig
 from poise.recipes.imitation import Imitation
@@ -203,6 +204,7 @@ def play(
     controller: Literal["policy", "lookahead"] = "policy",
     lookahead: LookaheadConfig | None = None,
     recover: bool = False,
+    rival: LearnedOnTop | None = None,
 ) -> Played:
     """A scene with compliance and without, from the same starts, which are off by `scene.starts`.
 
@@ -219,6 +221,7 @@ def play(
         lookahead: how it looks ahead.
         recover: get up after a fall and go on with the motion, which waits so long; an opponent stays
             down.
+        rival: what was learned on top for the opponent; None is what the player has learned.
 
     Raises:
         PoiseError: the body cannot do the scene, the clip cannot be read, or the policy has not learned
@@ -249,16 +252,20 @@ def play(
             code="settings-conflict",
         )
     task, stage = set_up(scene, tracker, seconds, clip)
-    rival: Imitation | None = None
+    opponent: Imitation | None = None
     if isinstance(scene, Chicken) and scene.against == "rival":
-        stage, rival = rival_stage(scene, tracker, stage)
+        stage, opponent = rival_stage(scene, tracker, stage)
         task = replace(task, props=stage.props, touches=stage.touches)
     both: list[Looked] = []
-    if learned is not None:
-        learned.check(tracker)
-        given = learned.config.played(given)
+    rival = rival or learned
+    for known in (learned, rival):
+        if known is not None:
+            known.check(tracker)
+            given = known.config.played(given)
     for compliance in (stage.yields(given), None):
-        others = () if rival is None else (opposing(rival, tracker, compliance),)
+        others: tuple[Opponent, ...] = ()
+        if opponent is not None:
+            others = (_against(opponent, tracker, compliance, None if compliance is None else rival),)
         events = (*stage.events, *others)
         own = replace(task.task, events=events, compliance=compliance, help_by="all")
         top = None if compliance is None else learned
@@ -268,6 +275,21 @@ def play(
         own = replace(task, task=own)
         both.append(_episodes(scene, tracker, own, count, threads, top, ahead, recover))
     return played(scene, both[0], both[1], name)
+
+
+def _against(
+    task: Imitation,
+    tracker: Tracker,
+    given: Compliance | Stiffness | None,
+    learned: LearnedOnTop | None,
+) -> Opponent:
+    """The opponent, with what was learned on top of its policy, which sees what it feels."""
+    if learned is None:
+        return opposing(task, tracker.policy, given)
+    stage = SceneSetup(obs=(feels(task.humanoid),))
+    own = replace(task.task, obs=(*task.task.obs, *seen(stage, learned.config)))
+    topped = Topped(tracker.policy, learned.top, learned.added)
+    return opposing(replace(task, task=own), topped, given, topped.begin)
 
 
 def _title(scene: str, motion: str) -> str:
