@@ -153,12 +153,20 @@ def test_a_crash_loses_nothing_and_work_can_be_stopped(client: Client):
     assert job["text"] == "looking ahead, 40 % done, 0:01 left"
     # The frames simulated so far can be seen, in whole rows, from any of them on.
     client.until(lambda s: s["jobs"] and s["jobs"][0]["drawn"])
-    for row, firsts in ((0, [0, 1, 2]), (2, [2]), (7, [])):
+
+    def drawn(row: int) -> np.ndarray:
         where = f"http://{client.where}/drawn/{job['id']}/{row}?token=secret-word"
         with urllib.request.urlopen(where, timeout=10) as got:
             data = got.read()
         assert json.loads(data[4:28]) == {"parents": [-1, 0]}
-        rows = np.frombuffer(data[28:], "<f4").reshape(-1, 7)
+        return np.frombuffer(data[28:], "<f4").reshape(-1, 7)
+
+    # The first one is told before the last one is written.
+    end = time.monotonic() + 10.0
+    while len(drawn(0)) < 3 and time.monotonic() < end:
+        time.sleep(0.05)
+    for row, firsts in ((0, [0, 1, 2]), (2, [2]), (7, [])):
+        rows = drawn(row)
         assert rows[:, 0].tolist() == firsts and (rows[:, 1] == 10 * rows[:, 0]).all()
     assert _status(client, f"/drawn/{job['id']}/0") == 401
     client.send(type="stop", job=job["id"])

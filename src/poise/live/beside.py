@@ -119,7 +119,8 @@ def _answer_all(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     # The loop comes first, where there is not a core for each.
-    os.nice(nice)
+    if hasattr(os, "nice"):
+        os.nice(nice)
     answer = begin(*args)
     while True:
         try:
