@@ -203,6 +203,8 @@ def thrown(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
     found = throws(tracker, given, levels, count, float(rate), threads=1, learned=top)
     out: dict[str, Any] = {"levels": list(levels), "fell": found.fell.sum(1).tolist(), "throws": count}
     out["goal_moved_mm"] = (1000 * np.nanmean(found.moved, 1)).tolist()
+    out["before_mm"] = (1000 * np.nanmean(found.off, 1)).tolist()
+    out["torque_nm"] = np.nanmean(found.torque, 1).tolist()
     for name in ("impulse", "peak", "torque"):
         values = getattr(found, name)
         ratio = values / values[:1]
@@ -214,6 +216,10 @@ def thrown(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
     return out
 
 
+#: Figures of throws by level beside the ratios.
+MORE = ("fell", "goal_moved_mm", "before_mm", "torque_nm")
+
+
 def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
     """Ratios of each throw to the first level's, and their slope over levels, with intervals of 95 %."""
     for unit, raw in raws.items():
@@ -223,7 +229,7 @@ def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:
             for name in ("impulse_ratio", "peak_ratio", "torque_ratio"):
                 middle, low, high = raw[name][k]
                 yield Figure(subject, name, middle, many, f"{short(low)} to {short(high)}")
-            values = {n: raw[n][k] for n in ("fell", "goal_moved_mm")}
+            values = {n: raw[n][k] for n in MORE if n in raw}
             yield from of(subject, values, many)
         for name in ("impulse", "peak", "torque"):
             if f"{name}_slope" in raw:

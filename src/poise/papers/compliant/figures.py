@@ -175,6 +175,7 @@ class Thrown:
         moved: m, how far the goal's pelvis and hinged bodies gave way at most, mean of the bodies.
         outside: share of the frames from the first contact on in which what gave way took a hinge of the
             goal out of its range.
+        off: m, how far the bodies were from their goal before the first contact, mean of all.
         fell: whether the character fell.
     """
 
@@ -184,6 +185,7 @@ class Thrown:
     torque: np.ndarray
     moved: np.ndarray
     outside: np.ndarray
+    off: np.ndarray
     fell: np.ndarray
 
 
@@ -202,7 +204,7 @@ def throws(
     """The same throws at each level, by the policy alone (Deep Compliant Control, Sec. 5.2 and Fig. 4).
 
     A ball comes at 2 to 3 m/s from a random direction, once. Up to the first contact the worlds of all
-    levels are the same to the last bit.
+    levels are the same to the last bit, unless what was learned sees the level.
 
     Args:
         given: how the character gives way; its level or stiffness is what `levels` replace.
@@ -258,8 +260,8 @@ def _at(
     obs, rate = env.reset_to(zero, zero), task.reference.rate_hz
     height = env.pose().pos[:, 0, 2].clone()
     impulse = torch.zeros(count, 3, dtype=torch.float64)
-    peak, torque, counted, moved, out, after = (
-        torch.zeros(count, dtype=torch.float64) for _ in range(6)
+    peak, torque, counted, moved, out, after, off, before = (
+        torch.zeros(count, dtype=torch.float64) for _ in range(8)
     )
     left = torch.full((count,), round(COUNTS_S * rate))
     hit, fell = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
@@ -279,14 +281,18 @@ def _at(
         servo = env.backend.state["qfrc_actuator"][:, 6:].abs().mean(1).double()
         torque += torch.where(now, servo, 0.0)
         counted += now
-        way = (env.goal_pose().pos - goal.layout.unpacked(goal.goal.now()).pos).norm(dim=-1).mean(1)
+        aim, pose = env.goal_pose(), env.pose()
+        off += torch.where(hit, 0.0, (pose.pos - aim.pos).norm(dim=-1).mean(1).double())
+        before += ~hit
+        way = (aim.pos - goal.layout.unpacked(goal.goal.now()).pos).norm(dim=-1).mean(1)
         moved = torch.maximum(moved, way.double())
         after += hit
         out += hit & yields.outside
-        fell |= env.pose().pos[:, 0, 2] < FALLEN * height
+        fell |= pose.pos[:, 0, 2] < FALLEN * height
     env.close()
     missed = torch.where(hit, 1.0, torch.nan).double()
-    rows = impulse.norm(dim=-1), peak, torque / counted.clamp_min(1.0), moved, out / after
+    mean = torque / counted.clamp_min(1.0)
+    rows = impulse.norm(dim=-1), peak, mean, moved, out / after, off / before.clamp_min(1.0)
     return (*((r * missed).numpy() for r in rows), fell.numpy())
 
 
