@@ -205,6 +205,7 @@ def thrown(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
     out["goal_moved_mm"] = (1000 * np.nanmean(found.moved, 1)).tolist()
     out["before_mm"] = (1000 * np.nanmean(found.off, 1)).tolist()
     out["torque_nm"] = np.nanmean(found.torque, 1).tolist()
+    out["torque_before_nm"] = np.nanmean(found.stood, 1).tolist()
     for name in ("impulse", "peak", "torque"):
         values = getattr(found, name)
         ratio = values / values[:1]
@@ -217,7 +218,7 @@ def thrown(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
 
 
 #: Figures of throws by level beside the ratios.
-MORE = ("fell", "goal_moved_mm", "before_mm", "torque_nm")
+MORE = ("fell", "goal_moved_mm", "before_mm", "torque_nm", "torque_before_nm")
 
 
 def throw_rows(places: Places, raws: Raws) -> Iterator[Figure]:

@@ -176,6 +176,7 @@ class Thrown:
         outside: share of the frames from the first contact on in which what gave way took a hinge of the
             goal out of its range.
         off: m, how far the bodies were from their goal before the first contact, mean of all.
+        stood: N m, the torque before the first contact.
         fell: whether the character fell.
     """
 
@@ -186,6 +187,7 @@ class Thrown:
     moved: np.ndarray
     outside: np.ndarray
     off: np.ndarray
+    stood: np.ndarray
     fell: np.ndarray
 
 
@@ -260,8 +262,8 @@ def _at(
     obs, rate = env.reset_to(zero, zero), task.reference.rate_hz
     height = env.pose().pos[:, 0, 2].clone()
     impulse = torch.zeros(count, 3, dtype=torch.float64)
-    peak, torque, counted, moved, out, after, off, before = (
-        torch.zeros(count, dtype=torch.float64) for _ in range(8)
+    peak, torque, counted, moved, out, after, off, stood, before = (
+        torch.zeros(count, dtype=torch.float64) for _ in range(9)
     )
     left = torch.full((count,), round(COUNTS_S * rate))
     hit, fell = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
@@ -283,6 +285,7 @@ def _at(
         counted += now
         aim, pose = env.goal_pose(), env.pose()
         off += torch.where(hit, 0.0, (pose.pos - aim.pos).norm(dim=-1).mean(1).double())
+        stood += torch.where(hit, 0.0, servo)
         before += ~hit
         way = (aim.pos - goal.layout.unpacked(goal.goal.now()).pos).norm(dim=-1).mean(1)
         moved = torch.maximum(moved, way.double())
@@ -292,7 +295,8 @@ def _at(
     env.close()
     missed = torch.where(hit, 1.0, torch.nan).double()
     mean = torque / counted.clamp_min(1.0)
-    rows = impulse.norm(dim=-1), peak, mean, moved, out / after, off / before.clamp_min(1.0)
+    off, stood = (x / before.clamp_min(1.0) for x in (off, stood))
+    rows = impulse.norm(dim=-1), peak, mean, moved, out / after, off, stood
     return (*((r * missed).numpy() for r in rows), fell.numpy())
 
 
