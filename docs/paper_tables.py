@@ -641,6 +641,11 @@ def _throws(law: str, level: str) -> str:
     return f"scenes:throws, {law}, {level}"
 
 
+def _by(scene: str) -> str:
+    """Words of rows with what a run learned of a scene."""
+    return f", learned by {scene}"
+
+
 _BLOWS = (
     Measure("greatest force over level 0's", "peak_ratio", "3", -1),
     Measure("impulse", "impulse_ratio", "3", -1),
@@ -658,6 +663,16 @@ _FIGURE_4 = PaperTable(
                 "level 0",
             )
             for rate in (60, 600)
+            for a in _LEVELS
+        ),
+        *(
+            Claim(
+                f"level {a}, 600 Hz, trained for the scene",
+                _throws(f"eq8, 600 Hz{_by('throws')}", f"level {a}"),
+                "better",
+                _throws(f"eq8, 600 Hz{_by('throws')}", "level 0"),
+                "level 0",
+            )
             for a in _LEVELS
         ),
         *(
@@ -685,13 +700,13 @@ _SLOPES = PaperTable(
     (
         *(
             Claim(
-                f"throws, {r} Hz",
-                _throws(f"eq8, {r} Hz", "all levels"),
+                f"throws, {r} Hz{', trained for the scene' if by else ''}",
+                _throws(f"eq8, {r} Hz{by}", "all levels"),
                 "better",
                 beside="none",
                 words="a slope below",
             )
-            for r in (60, 600)
+            for r, by in ((60, ""), (600, ""), (600, _by("throws")))
         ),
     ),
     f"{_SCENES} throws",
@@ -783,8 +798,39 @@ _CHICKEN = PaperTable(
             )
             for who, kg in (("heavy", 36), ("light", 85))
         ),
+        *(
+            Claim(
+                "the light one, both trained",
+                f"{_FIGHT}{_by('chicken').removeprefix(', ')}, level 0.16",
+                "better",
+                f"{_FIGHT}{_by('chicken').removeprefix(', ')}, {than}",
+                beside,
+                metric="rival_pushed_mm",
+                than_metric=metric,
+                words="farther than",
+            )
+            for than, beside, metric in (
+                ("level 0.16", "the heavy one", "pushed_mm"),
+                ("level 0", "the light one at level 0", "rival_pushed_mm"),
+            )
+        ),
     ),
     f"{_SCENES} chicken",
+)
+_HOPS = PaperTable(
+    (share("lost", "lost", -1), Measure("off the way, m", "off_m", "3", -1)),
+    (
+        Claim("level 0.16", "scenes:chicken, hopping alone for 17 s, level 0.16"),
+        Claim(
+            "level 0.16, trained for the scene",
+            f"scenes:chicken, hopping alone for 17 s{_by('chicken')}, level 0.16",
+            "better",
+            "scenes:chicken, hopping alone for 17 s, level 0.16",
+            "not trained",
+        ),
+    ),
+    f"{_SCENES} chicken",
+    printed="a motion of 17.6 s",
 )
 _FORCES = PaperTable(
     (
@@ -820,6 +866,17 @@ _FIGURE_5 = PaperTable(
                 "better",
                 "scenes:trampoline, without",
                 "without compliance",
+                judged=("foot_low_m", "energy_j"),
+            )
+            for a in ("0.04", "0.16")
+        ),
+        *(
+            Claim(
+                f"level {a}, trained for the scene",
+                f"scenes:trampoline{_by('trampoline')}, level {a}",
+                "better",
+                f"scenes:trampoline{_by('trampoline')}, level 0",
+                "level 0",
                 judged=("foot_low_m", "energy_j"),
             )
             for a in ("0.04", "0.16")
@@ -873,7 +930,7 @@ _OPENED = PaperTable(
             paper="Deep Compliant Control, Sec. 5.4; a door of any width",
             judged=("angle_rad",),
         )
-        for how in ("without", "level 0.16", _LAG)
+        for how in ("without", "level 0.16", _LAG, f"{_by('door').removeprefix(', ')}, as learned")
         for width in ("1", "1.35", "1.7")
     ),
     f"{_SCENES} door",
@@ -1249,6 +1306,7 @@ PAPER_TABLES: dict[str, PaperTable] = {
     "dcc-ranges": _RANGES,
     "dcc-hands": _HANDS,
     "dcc-chicken": _CHICKEN,
+    "dcc-hops": _HOPS,
     "dcc-chicken-forces": _FORCES,
     "dcc-figure-5": _FIGURE_5,
     "dcc-figure-6": _FIGURE_6,

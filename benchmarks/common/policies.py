@@ -17,6 +17,7 @@ FILES = {
     "keypoints": "keypoints.safetensors",
     "generator": "generator.safetensors",
     "ball": "ball.safetensors",
+    "chicken": "chicken.safetensors",
     "inbetween": "inbetween/model.safetensors",
 }
 

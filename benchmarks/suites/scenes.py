@@ -37,6 +37,7 @@ from poise.papers.compliant.figures import measure, slope, throws
 from poise.papers.compliant.motions import hopping, motion_of, standing
 from poise.papers.compliant.scene_play import COUNTS, Played, play
 from poise.papers.compliant.scene_training import (
+    SHIPPED,
     Compliant,
     LearnedOnTop,
     digest_of,
@@ -386,14 +387,19 @@ TOP_LEVELS, BY = ("level 0", "level 0.04", "level 0.16", "level 0.2"), ", learne
 
 @cache
 def tops(places: Places) -> dict[str, LearnedOnTop]:
-    """The policies that runs have learned on top, by the names of their folders."""
-    home = places.work / "compliant"
+    """What comes along on top of the policy by its scene, but the ball's, and what runs in `--work`,
+    compliant/NAME, have learned beside."""
+    home, below = places.work / "compliant", policy()
     if places.smoke and not home.exists():
         net = PPOConfig(horizon=2, epochs=1, minibatch=4, policy_hidden=(8,), value_hidden=(8,))
         tiny = Compliant("throws", seconds=0.5, num_envs=2, ppo=net)
-        train(tiny, policy(), home / "smoke", Until(iterations=1), threads=1, tensorboard=False)
-    found = (file.parent for file in sorted(home.glob(f"*/{LATEST}")))
-    return {folder.name: open_learned(folder, policy()) for folder in found}
+        train(tiny, below, home / "smoke", Until(iterations=1), threads=1, tensorboard=False)
+    runs = (file.parent for file in sorted(home.glob(f"*/{LATEST}")))
+    found = {run.name: open_learned(run, below) for run in runs}
+    if places.smoke:
+        return found
+    along = ((name, shipped(name, below)) for name in SHIPPED if name != "ball")
+    return found | {name: top for name, top in along if top is not None}
 
 
 def fits(top: LearnedOnTop, unit: str) -> bool:
@@ -428,7 +434,11 @@ def on_top(places: Places, unit: str) -> Any:
     below, on = stated(_SHIPS), top.config.policy
     if on:
         below = f"{Path(on).name} {digest_of(policy(on).policy)}"
-    return raw | {"policy": f"{below}; {name} {digest_of(top.top)} (learned on top)"}
+    return raw | {
+        "policy": stated(("tracker", name))
+        if name in SHIPPED
+        else f"{below}; {name} {digest_of(top.top)} (learned on top)"
+    }
 
 
 def top_rows(places: Places, raws: Raws) -> Iterator[Figure]:
@@ -540,7 +550,13 @@ PARTS = {
         )
     },
     "learned": Part(
-        "scenes with what was learned on top", top_units, on_top, top_rows, _SHIPS, hours=3.0, needs=()
+        "scenes with what was learned on top",
+        top_units,
+        on_top,
+        top_rows,
+        ("tracker", *(name for name in SHIPPED if name != "ball")),
+        hours=3.0,
+        needs=("data",),
     ),
     "cost": Part(
         "what compliance costs", lambda _: ["cost"], costs, cost_rows, alone=True, hours=0.05, needs=()

@@ -64,6 +64,20 @@ def test_a_scene_with_lookahead(tmp_path: Path) -> None:
     assert main(["play", "compliant", "ball", *argv[3:], "--force"]) == 0
 
 
+def test_what_comes_along_is_asked_for_what_it_learned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["play", "compliant", "chicken", "--count", "1", "--duration", "0.5", "--threads", "1"]
+    found = list[str]()
+    for words in ((), ("--learned", "none"), ("--stiffness", "500")):
+        out = tmp_path / str(len(found))
+        assert main([*argv, *words, "--json", "-o", str(out)]) == 0
+        found.append((out / "simulated.bvh").read_text())
+        capsys.readouterr()
+    # A stiffness is not among what was learned, so that the policy below acts alone.
+    assert found[0] != found[1] and found[0] != found[2]
+
+
 def test_a_run_of_that_name_is_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

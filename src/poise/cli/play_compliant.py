@@ -104,8 +104,8 @@ def run(
         pushes: ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0).
         seed: throws, ball, chicken: of the draws (0).
         learned: what was learned on top of the policy: the folder of poise train compliant SCENE, at
-            --level where it learned levels; in a fight for both. For the ball something comes along;
-            none goes without.
+            --level where it learned levels; in a fight for both. For ball and chicken something comes
+            along; none goes without.
             pull, hands: also that of poise train compliant-imitation, which stands by itself.
         recover: get up after a fall and go on; an opponent stays down.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the
@@ -172,8 +172,9 @@ def run(
         chosen = level is not None or newtons_per_metre is not None
         if learned is None:
             knows = None if controller == "lookahead" else shipped(scene, tracker)
-            # A policy that comes along and has learned no levels is not asked for one.
-            knows = None if chosen and knows is not None and knows.config.drawn is None else knows
+            # What comes along is asked for nothing that it has not learned.
+            drawn = knows is not None and knows.config.drawn is not None
+            knows = None if (newtons_per_metre is not None if drawn else chosen) else knows
         else:
             knows = None if str(learned) == "none" else open_learned(learned, tracker)
             if knows is not None and knows.config.policy and policy is None:

@@ -22,6 +22,7 @@ from poise.papers.compliant.figures import throws
 from poise.papers.compliant.scene_play import play
 from poise.papers.compliant.scene_training import (
     RUN_FILE,
+    SHIPPED,
     Added,
     Compliant,
     OnTop,
@@ -133,6 +134,9 @@ def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
     # A rod that nobody balances has fallen after 1.5 s.
     assert made.figures["stays_s"] > 4.9 and made.stiff["stays_s"] < 2.0 and made.figures["lost"] == 0
     assert shipped("ball", another(tracker)) is None
+    hops = shipped("chicken", tracker)
+    assert hops is not None and hops.config.drawn == (0.0, 0.2)
+    assert all(file.stat().st_size < 500_000 for file in SHIPPED.values())
     with refused("policies-differ"):
         play(learned.config.play(), another(tracker), None, None, 2, 5.0, 1, "ball", learned)
 

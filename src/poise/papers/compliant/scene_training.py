@@ -430,7 +430,9 @@ RECIPE: dict[str, Any] = {"name": "compliant", "config": Compliant}
 #: What a run begins with.
 RUN_FILE = "compliant.json"
 #: What comes along on top of the policy that comes along, by scene.
-SHIPPED = {"ball": Path(__file__).parents[2] / "data" / "ball.safetensors"}
+SHIPPED = {
+    scene: Path(__file__).parents[2] / "data" / f"{scene}.safetensors" for scene in ("ball", "chicken")
+}
 
 
 @dataclass(frozen=True, eq=False)
