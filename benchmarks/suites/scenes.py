@@ -382,7 +382,7 @@ def scene_rows(places: Places, raws: Raws) -> Iterator[Figure]:
 
 
 #: Levels at which what has learned several is measured in scenes; the words before a run's name.
-TOP_LEVELS, BY = ("level 0", "level 0.04", "level 0.16", "level 0.2"), ", learned by "
+TOP_LEVELS, BY = ("level 0.04", "level 0.16", "level 0.2"), ", learned by "
 
 
 @cache

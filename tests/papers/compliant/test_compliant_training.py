@@ -183,6 +183,9 @@ def test_what_learned_levels_is_played_at_each(tracker: Tracker, tmp_path: Path)
     played = play(config.play(), tracker, None, Compliance(0.05), 1, 0.5, 1, "throws", learned)
     given = played.imitation.task.compliance
     assert isinstance(given, Compliance) and given.level == 0.05 and given.drawn is None
+    # The twin that does not give way acts with it, too.
+    lone = play(config.play(), tracker, None, Compliance(0.05), 1, 0.5, 1, "throws")
+    assert (played.stiff_episodes["torque_nm"] != lone.stiff_episodes["torque_nm"]).all()
     # The policy on top acts, at the level that is asked for.
     found = throws(tracker, Compliance(), (0.0, 0.1), 2, threads=1, learned=learned)
     plain = throws(tracker, Compliance(), (0.0,), 2, threads=1)

@@ -215,7 +215,8 @@ def play(
         count: of episodes, side by side.
         name: of the scene, by default that of its class.
         learned: what was learned on top of the policy, for the character that gives way; it gives way as
-            it has learned to, or by the level that is given where it has learned several.
+            it has learned to, or by the level that is given where it has learned several, and then acts
+            in the twin, too.
         controller: the policy alone, or with lookahead, which simulates the scene with all that is going
             to happen in it; not with what was learned on top, nor against an opponent.
         lookahead: how it looks ahead.
@@ -265,16 +266,23 @@ def play(
     for compliance in (stage.yields(given), None):
         others: tuple[Opponent, ...] = ()
         if opponent is not None:
-            others = (_against(opponent, tracker, compliance, None if compliance is None else rival),)
+            others = (_against(opponent, tracker, compliance, _acting(rival, compliance)),)
         events = (*stage.events, *others)
         own = replace(task.task, events=events, compliance=compliance, help_by="all")
-        top = None if compliance is None else learned
+        top = _acting(learned, compliance)
         if top is not None:
             own = replace(own, obs=(*own.obs, *seen(stage, top.config)))
         ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
         own = replace(task, task=own)
         both.append(_episodes(scene, tracker, own, count, threads, top, ahead, recover))
     return played(scene, both[0], both[1], name)
+
+
+def _acting(learned: LearnedOnTop | None, given: Compliance | Stiffness | None) -> LearnedOnTop | None:
+    """What acts on top of the policy: what has learned levels acts in the twin as well, which is its
+    level 0."""
+    levels = learned is not None and learned.config.drawn is not None
+    return learned if levels or given is not None else None
 
 
 def _against(
