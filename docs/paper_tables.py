@@ -818,7 +818,11 @@ _CHICKEN = PaperTable(
     f"{_SCENES} chicken",
 )
 _HOPS = PaperTable(
-    (share("lost", "lost", -1), Measure("off the way, m", "off_m", "3", -1)),
+    (
+        Measure("on one leg, s", "one_leg_s", "1"),
+        share("to the end", "one_leg"),
+        share("lost", "lost", -1),
+    ),
     (
         Claim("level 0.16", "scenes:chicken, hopping alone for 17 s, level 0.16"),
         Claim(

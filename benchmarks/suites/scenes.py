@@ -34,7 +34,7 @@ from poise.jobs.tracker import Tracker
 from poise.learn import LATEST, PPOConfig, Until
 from poise.motion import Clip
 from poise.papers.compliant.figures import measure, slope, throws
-from poise.papers.compliant.motions import hopping, motion_of, standing
+from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.scene_play import COUNTS, Played, play
 from poise.papers.compliant.scene_training import (
     SHIPPED,
@@ -311,13 +311,7 @@ SCENES: dict[str, Case] = {
     "trampoline": (TrampolineScene(), ("level 0.16", "level 0.04"), 8.0, 32),
     **{k: (Balance(**v), ("linear law", "learned"), 20.0, 32) for k, v in BALL.items()},
     **{k: (s, ways, 8.0, 32) for k, (s, ways) in CHICKEN.items()},
-    # Nothing is thrown in that time.
-    (HOPS := "chicken, hopping alone for 17 s"): (
-        Throws(every_s=(100.0, 100.0)),
-        ("level 0.16",),
-        17.0,
-        32,
-    ),
+    (HOPS := "chicken, hopping alone for 17 s"): (Chicken(against="nobody"), ("level 0.16",), 17.0, 32),
 }
 
 
@@ -337,8 +331,6 @@ def played(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
     clip = read_clip(WALK) if unit.endswith("walking") else None
     if unit.endswith("running"):
         clip = moment() if places.smoke else read_clip(places.data / RUN)
-    if unit == HOPS:
-        clip = hopping(tracker, seconds)
     rival = None
     if top is not None and isinstance(scene, Chicken):
         # The opponent acts with what a run of its own mass has learned, where there is one.
@@ -405,8 +397,6 @@ def tops(places: Places) -> dict[str, LearnedOnTop]:
 def fits(top: LearnedOnTop, unit: str) -> bool:
     """Whether a case of the suite is of the scene that was learned, with the same players."""
     scene, own = SCENES[unit][0], top.config.play()
-    if unit == HOPS:
-        return isinstance(own, Chicken)
     if isinstance(scene, Chicken) and isinstance(own, Chicken):
         return (scene.mass, scene.other) == (own.mass, own.other)
     return type(scene) is type(own)

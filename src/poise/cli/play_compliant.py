@@ -54,7 +54,7 @@ def run(
     sway: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
     mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None,
     other: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None,
-    against: Annotated[Literal["bag", "rival"] | None, arg(help_behavior_hint="")] = None,
+    against: Annotated[Literal["bag", "rival", "nobody"] | None, arg(help_behavior_hint="")] = None,
     width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
     made_for: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
@@ -94,7 +94,8 @@ def run(
         sway: hands: how far the partner's hand swings (0.1).
         mass: throws: of the ball (1). chicken: of the player (85).
         other: chicken: of the opponent (36).
-        against: chicken: a punching bag as heavy as the opponent (default), or the opponent itself.
+        against: chicken: a punching bag as heavy as the opponent (default), the opponent itself, or
+            nobody.
         width: door: how wide (1).
         made_for: door: how wide the door is for which the motion is made; by default the door's own
             width.

@@ -22,6 +22,7 @@ from poise.jobs.track.placement import place
 from poise.papers.compliant.scenes import (
     SCENES,
     Balance,
+    Chicken,
     DoorScene,
     HandInHand,
     PlayScene,
@@ -32,6 +33,7 @@ from poise.papers.compliant.scenes import (
     door,
 )
 from poise.papers.compliant.scenes import body_scenes as trampoline
+from poise.papers.compliant.scenes.body_scenes import LiftedFoot
 from poise.papers.compliant.scenes.stage import small_forces
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Scene, SceneSim
@@ -342,3 +344,21 @@ def test_a_skeleton_without_a_head(task: Imitation) -> None:
 def test_scenes_that_are_none(made: object, what: str) -> None:
     with refused("out-of-range", says=what):
         made()  # type: ignore[operator]
+
+
+def test_a_foot_that_is_put_down_loses(task: Imitation) -> None:
+    foot = LiftedFoot(task.humanoid)
+    pose = task.reference.pose
+    pos, quat = pose.pos[:1].float(), pose.quat[:1].float()
+    # It stands, or hangs as high as the character is lifted.
+    stands = foot.height(pos, quat)
+    assert abs(float(stands)) < 0.02
+    up = pos + torch.tensor([0.0, 0.0, 0.1])
+    torch.testing.assert_close(foot.height(up, quat), stands + 0.1)
+    (end,) = Chicken().stage(task.humanoid, task.reference).dones
+
+    class Seen:
+        phase = torch.tensor([0.0, 1.0, 1.0])
+        sim = SimpleNamespace(pos=torch.cat((pos, pos, up)), quat=quat.expand(3, -1, -1))
+
+    assert end.fn(Seen(), **{**end.params, "share": 0.5}).tolist() == [False, True, False]  # type: ignore[arg-type]

@@ -46,7 +46,7 @@ from poise.score.rollouts import RolloutSet
 #: m/s^2; greatest force, in weights of a character, about which nothing is said.
 G, MOST_WEIGHTS = 9.81, 20.0
 #: Figures of which episodes are counted.
-COUNTS = frozenset(("lost", "opened", "touched", "rival_fell", "falls", "up_again"))
+COUNTS = frozenset(("lost", "opened", "touched", "rival_fell", "one_leg", "falls", "up_again"))
 #: What the figures are, in words.
 WORDS = {
     "force_mean_n": "Interaction force, mean while it acts, N",

@@ -24,7 +24,7 @@ from poise.papers.compliant.figures import FALLEN, TOUCHES_N
 from poise.papers.compliant.opponents import Opponent
 from poise.papers.compliant.scenes import Balance, Chicken, DoorScene, PlayScene, TrampolineScene
 from poise.papers.compliant.scenes.ball import COS_45, upright_of
-from poise.papers.compliant.scenes.body_scenes import Bounce
+from poise.papers.compliant.scenes.body_scenes import ONE_LEG_S, SOLE_M, Bounce, LiftedFoot
 from poise.papers.compliant.scenes.door import WANTED, across
 from poise.recipes.imitation import Imitation
 from poise.score.report import Mover, Shape
@@ -342,6 +342,8 @@ class ChickenMeter:
         "rival_pushed_mm": "The same of its opponent, mm",
         "touched": "Episodes with a touch",
         "rival_fell": "Episodes in which the opponent fell",
+        "one_leg_s": "On one leg until the other foot is put down, s",
+        "one_leg": "Episodes on one leg to the end",
     }
 
     def begin(self, env: ImitationEnv) -> None:
@@ -353,8 +355,14 @@ class ChickenMeter:
         self._from = torch.zeros(len(self._envs), n, 2)
         self._way = torch.zeros(len(self._envs), n)
         self._fell = torch.zeros(n, dtype=torch.bool)
+        self._foot = LiftedFoot(env.goal.humanoid)
+        self._one_leg, self._hops = torch.ones(n, dtype=torch.bool), torch.zeros(n)
 
     def see(self, env: ImitationEnv, step: int) -> None:
+        pose, rate = env.pose(), env.goal.rate_hz
+        if step >= ONE_LEG_S * rate:
+            self._one_leg &= self._foot.height(pose.pos, pose.quat) >= SOLE_M
+            self._hops += self._one_leg / rate
         off = torch.stack([_off(e) for e in self._envs])
         felt = self._part.felt()
         assert felt is not None
@@ -373,7 +381,12 @@ class ChickenMeter:
 
     def figures(self) -> dict[str, Tensor]:
         way = 1000.0 * self._way.where(self._left == 0, torch.nan)
-        found = {"pushed_mm": way[0], "touched": self._left >= 0}
+        found = {
+            "pushed_mm": way[0],
+            "touched": self._left >= 0,
+            "one_leg_s": self._hops,
+            "one_leg": self._one_leg,
+        }
         return found if len(way) == 1 else {**found, "rival_pushed_mm": way[1], "rival_fell": self._fell}
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env.events import EpisodeStart
+from poise.env.frame import DoneTerm, Frame
 from poise.env.pushes import Push
 from poise.env.reference import Reference
 from poise.env.scene_events import (
@@ -31,6 +32,9 @@ from poise.env.scene_events import (
     touches_of,
 )
 from poise.errors import PoiseError
+from poise.kinematics.forward import shapes_of
+from poise.metrics.shape_points import foot_points
+from poise.motion.rotations import quat_rotate
 from poise.papers.compliant.scenes.stage import (
     CONTACTS_HZ,
     LINKED,
@@ -126,18 +130,52 @@ HEAVY_KG, LIGHT_KG = 85.0, 36.0
 
 #: s, how soft a punching bag is. A hard one wedges a player that has fallen under it.
 BAG_S = 0.1
+#: s into the motion from which on a player hops on one leg; m, a sole below that is on the floor.
+ONE_LEG_S, SOLE_M = 1.2, 0.01
+
+
+class LiftedFoot:
+    """The sole of the foot that a player lifts, which is the left one.
+
+    Raises:
+        PoiseError: the body has none.
+    """
+
+    def __init__(self, humanoid: Humanoid):
+        rows = humanoid.table.rows
+        found = next((i for i in humanoid.feet if rows[i].side == "left"), None)
+        if found is None:
+            raise PoiseError(
+                "the skeleton has no left foot, which 'chicken' lifts",
+                hint=f"Its bodies are {', '.join(humanoid.bodies)}",
+                code="body-part-missing",
+            )
+        still = torch.zeros(len(rows), 3), torch.eye(4)[:1].expand(len(rows), 4)
+        self.row, self.points = found, foot_points(*still, shapes_of(humanoid.table), [found])
+
+    def height(self, pos: Tensor, quat: Tensor) -> Tensor:
+        """m, of its lowest point `(N,)`, of bodies `pos (N, B, 3)` m and `quat (N, B, 4)`."""
+        turn = quat[:, self.row, None].expand(-1, len(self.points), 4)
+        arms = quat_rotate(turn, self.points.to(quat).expand(len(quat), -1, 3))
+        return (pos[:, self.row, None] + arms)[..., 2].amin(1)
+
+    def put_down(self, frame: Frame, share: float) -> Tensor:
+        """Whether it is on the floor after that share of the motion `(N,)`."""
+        low = self.height(frame.sim.pos, frame.sim.quat) < SOLE_M
+        return low & (frame.phase > share)
 
 
 @dataclass(frozen=True)
 class Chicken:
     """A player hops on one leg and bumps into what weighs as much as its opponent: a punching bag that
-    comes at it from all around, as the paper trains it, or the opponent itself, hopping, too.
+    comes at it from all around, as the paper trains it, or the opponent itself, hopping, too. Where it
+    learns, it loses once it puts the other foot down.
 
     Masses scale inertia, gains and torques of the same body, so that each player alone moves alike.
 
     Attributes:
         mass, other: kg, of the player and its opponent.
-        against: "bag" or "rival".
+        against: "bag", "rival", or "nobody".
         speed: m/s of the bag, drawn between.
         seed: of the draws.
     """
@@ -147,7 +185,7 @@ class Chicken:
 
     mass: Annotated[float, Range(2, 500, unit="kg")] = HEAVY_KG
     other: Annotated[float, Range(2, 500, unit="kg")] = LIGHT_KG
-    against: Literal["bag", "rival"] = "bag"
+    against: Literal["bag", "rival", "nobody"] = "bag"
     speed: tuple[float, float] = (0.8, 1.2)
     seed: int = 0
 
@@ -156,7 +194,7 @@ class Chicken:
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The bag, its throws and all touches with it; of a rival the touches alone."""
-        name = "bag" if self.against == "bag" else RIVAL
+        name = RIVAL if self.against == "rival" else "bag"
         touches = touches_of("felt", name, humanoid.bodies)
         felt = tuple(t.name for t in touches)
         hit = Touch("hit", name, "character")
@@ -168,9 +206,20 @@ class Chicken:
         far = SetDown(name, (30.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0))
         throw = Throw(name, chest, self.speed, 1.0, (2.0, 2.0), (-0.1, 0.1), self.seed)
         bag = Box(name, (0.35, 0.35, 0.9), (30.0, 0.0, 0.5), mass=self.other, soft_s=BAG_S)
-        part = InScene(metered=(hit.name,), felt=felt, events=(far, throw))
-        paid = (eased(humanoid, BUMPED_SHARE),)
-        return SceneSetup((bag,), (), touches, (part,), (feels(humanoid),), paid, from_start=True)
+        comes = (far,) if self.against == "nobody" else (far, throw)
+        part = InScene(metered=(hit.name,), felt=felt, events=comes)
+        lasts = (int(reference.length[0]) - 1) / reference.rate_hz
+        down = DoneTerm("task/put_down", LiftedFoot(humanoid).put_down, {"share": ONE_LEG_S / lasts})
+        return SceneSetup(
+            (bag,),
+            (),
+            touches,
+            (part,),
+            (feels(humanoid),),
+            (eased(humanoid, BUMPED_SHARE),),
+            (down,),
+            from_start=True,
+        )
 
 
 def weighing(humanoid: Humanoid, kg: float) -> Humanoid:
