@@ -293,7 +293,7 @@ _ENDLESS = PaperTable(
                 ("motion without end, ten minutes each", "policy alone, ten minutes each"),
                 ("motion without end, a minute each", "policy alone"),
                 ("futures tried, ten minutes each (ours alone)", "futures tried, ten minutes each"),
-                ("the same with lookahead, a minute each (ours alone)", "lookahead"),
+                ("the same with lookahead, ten minutes each (ours alone)", "lookahead"),
             )
         ),
         Claim("nothing (action 0), which stays down", _STILL, printed="no row"),
@@ -1181,11 +1181,12 @@ _PHC_2 = PaperTable(
         ),
         *(
             Claim(
-                f"an estimator's errors added, strength {k} (ours alone)",
-                f"track:Bandai, never learned (validation), noise {rung}; policy alone",
+                f"an estimator's errors added, strength {k}{more} (ours alone)",
+                f"track:Bandai, never learned (validation), noise {rung}; {how}",
                 printed="no row",
-                run="python -m benchmarks track --only noise",
+                run=f"python -m benchmarks track --only 'noise{more}'",
             )
+            for more, how in (("", "policy alone"), (", lookahead", "with lookahead"))
             for k, rung in (
                 (0, "clean"),
                 (0.25, "all x0.25"),
