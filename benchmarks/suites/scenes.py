@@ -286,6 +286,7 @@ DOORS = {
     else DoorScene(1.0)
     for w, m in ((1.0, None), (1.35, None), (1.7, None), (1.35, 1.0), (1.7, 1.0))
 }
+HOPS = "chicken, hopping alone for 17 s"
 RUN = "other/bandai_bvh/dataset-1_run_normal_001.bvh"
 #: Scenes, what gives way beside the twin that does not, s, episodes.
 SCENES: dict[str, Case] = {
@@ -311,7 +312,7 @@ SCENES: dict[str, Case] = {
     "trampoline": (TrampolineScene(), ("level 0.16", "level 0.04"), 8.0, 32),
     **{k: (Balance(**v), ("linear law", "learned"), 20.0, 32) for k, v in BALL.items()},
     **{k: (s, ways, 8.0, 32) for k, (s, ways) in CHICKEN.items()},
-    (HOPS := "chicken, hopping alone for 17 s"): (Chicken(against="nobody"), ("level 0.16",), 17.0, 32),
+    HOPS: (Chicken(against="nobody"), ("level 0.16",), 17.0, 32),
 }
 
 

@@ -173,7 +173,7 @@ def run(
         chosen = level is not None or newtons_per_metre is not None
         if learned is None:
             knows = None if controller == "lookahead" else shipped(scene, tracker)
-            # What comes along is asked for nothing that it has not learned.
+            # A policy that comes along is asked for nothing that it has not learned.
             drawn = knows is not None and knows.config.drawn is not None
             knows = None if (newtons_per_metre is not None if drawn else chosen) else knows
         else:

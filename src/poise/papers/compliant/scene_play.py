@@ -279,7 +279,7 @@ def play(
 
 
 def _acting(learned: LearnedOnTop | None, given: Compliance | Stiffness | None) -> LearnedOnTop | None:
-    """What acts on top of the policy: what has learned levels acts in the twin as well, which is its
+    """The policy on top that acts: one that has learned levels acts in the twin as well, which is its
     level 0."""
     levels = learned is not None and learned.config.drawn is not None
     return learned if levels or given is not None else None

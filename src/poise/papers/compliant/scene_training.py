@@ -504,7 +504,7 @@ def begin(folder: Path, config: Compliant, below: str) -> Compliant:
     return config
 
 
-#: Hz, at most, of the physics while a scene is learned: five times the samples of its own rate's.
+#: Hz, at most, of the physics while a scene is learned: at its own rate there are few samples.
 LEARNS_HZ = 120.0
 
 
