@@ -740,6 +740,8 @@ def _hands() -> tuple[Claim, ...]:
     out = list[Claim]()
     for how, title in (
         ("running", "running"),
+        ("two people running", "two people running, both giving way"),
+        ("two people walking", "two people walking, both giving way (ours alone)"),
         ("walking", "walking (ours alone)"),
         ("standing", "standing (ours alone)"),
     ):
@@ -749,6 +751,11 @@ def _hands() -> tuple[Claim, ...]:
                 Claim(f"{title}, {way}", f"{scene}{way}", "better", f"{scene}without", "the stiff twin")
             )
         out.append(Claim(f"{title}, nobody touches", f"{scene}nobody touches", printed="no row"))
+    walking, by = "scenes:hand in hand, walking, ", f"{_by('hands')}, "
+    for level in ("level 0.16", "level 0.2"):
+        ours, than = f"{walking}{by}{level}", f"{walking}{by}without"
+        name = f"walking (ours alone), {level}, trained for the scene"
+        out.append(Claim(name, ours, "better", than, "the stiff twin, trained, too", run=_LEARNED))
     return tuple(out)
 
 

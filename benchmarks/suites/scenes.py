@@ -286,6 +286,7 @@ DOORS = {
     else DoorScene(1.0)
     for w, m in ((1.0, None), (1.35, None), (1.7, None), (1.35, 1.0), (1.7, 1.0))
 }
+TWO = ("level 0.16", "level 0.2", LAG)
 HOPS = "chicken, hopping alone for 17 s"
 RUN = "other/bandai_bvh/dataset-1_run_normal_001.bvh"
 #: Scenes, what gives way beside the twin that does not, s, episodes.
@@ -308,6 +309,8 @@ SCENES: dict[str, Case] = {
         8.0,
         32,
     ),
+    "hand in hand, two people walking": (HandInHand(partner="person"), TWO, 8.0, 32),
+    "hand in hand, two people running": (HandInHand(partner="person"), TWO, 8.0, 32),
     **{k: (s, ("level 0.16", LAG, "stiffness 200, lag 0.5 s"), 0.0, 32) for k, s in DOORS.items()},
     "trampoline": (TrampolineScene(), ("level 0.16", "level 0.04"), 8.0, 32),
     **{k: (Balance(**v), ("linear law", "learned"), 20.0, 32) for k, v in BALL.items()},
@@ -433,9 +436,11 @@ def on_top(places: Places, unit: str) -> Any:
 
 
 def top_rows(places: Places, raws: Raws) -> Iterator[Figure]:
-    """Rows as those of the plain policy, which stand in the other parts; these state the run."""
+    """Rows as those of the plain policy, which stand in the other parts; these state the run. The twin
+    that does not give way acts with what was learned where that is levels, else by the plain policy."""
     for unit, raw in raws.items():
-        own = {k: v for k, v in raw.items() if k not in ("policy", "without")}
+        plain = ("policy", "without") if "as learned" in raw else ("policy",)
+        own = {k: v for k, v in raw.items() if k not in plain}
         if unit.startswith("throws"):
             rows = throw_rows(places, {unit.removeprefix("throws, "): own})
         else:

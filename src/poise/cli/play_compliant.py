@@ -52,6 +52,7 @@ def run(
     side: Annotated[Literal["left", "right"] | None, arg(help_behavior_hint="")] = None,
     lead: Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")] = None,
     sway: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None,
+    partner: Annotated[Literal["carried", "person"] | None, arg(help_behavior_hint="")] = None,
     mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None,
     other: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None,
     against: Annotated[Literal["bag", "rival", "nobody"] | None, arg(help_behavior_hint="")] = None,
@@ -92,6 +93,8 @@ def run(
         side: pull, hands: which hand (left).
         lead: hands: how much faster than the motion the partner goes (0).
         sway: hands: how far the partner's hand swings (0.1).
+        partner: hands: a hand that is carried along (default), or a person who does the same in a mirror
+            and gives way, too.
         mass: throws: of the ball (1). chicken: of the player (85).
         other: chicken: of the opponent (36).
         against: chicken: a punching bag as heavy as the opponent (default), the opponent itself, or
@@ -135,6 +138,7 @@ def run(
         "side": side,
         "lead": lead,
         "sway": sway,
+        "partner": partner,
         "mass": mass,
         "width": width,
         "made_for": made_for,

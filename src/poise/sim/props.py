@@ -302,15 +302,19 @@ class Ball(Checked):
         radius: m.
         mass: kg.
         pos: m, its centre at first.
+        touched: whether things touch it; what hands hold by links need not be touched.
     """
 
     name: str = "ball"
     radius: Positive = 0.12
     mass: Positive = 0.6
     pos: Vector = (0.0, 0.0, 0.12)
+    touched: bool = True
 
     def add(self, spec: mujoco.MjSpec) -> None:
         """Adds one body."""
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
         body.add_freejoint(name=self.name)
-        solid(body, self.name, "sphere", [self.radius], mass=self.mass)
+        geom = solid(body, self.name, "sphere", [self.radius], mass=self.mass)
+        if not self.touched:
+            geom.contype = geom.conaffinity = 0

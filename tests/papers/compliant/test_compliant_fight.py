@@ -1,4 +1,4 @@
-"""The chicken fight in miniature: a hopping motion, players of other masses, an opponent."""
+"""Two characters in a scene, in miniature: the chicken fight, and hand in hand."""
 
 from __future__ import annotations
 
@@ -14,8 +14,18 @@ from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.papers.compliant.motions import BEGINS_S, FLIES_S, STANDS_S, G, hopping, hops
-from poise.papers.compliant.opponents import APART_M, Opponent, opposing, rival_stage, weighed
-from poise.papers.compliant.scenes import Chicken
+from poise.papers.compliant.opponents import (
+    APART_M,
+    HANDS_APART_M,
+    Opponent,
+    opposing,
+    partner_stage,
+    rival_stage,
+    weighed,
+)
+from poise.papers.compliant.scene_play import play
+from poise.papers.compliant.scenes import Chicken, HandInHand
+from poise.papers.compliant.scenes.stage import hand_of
 from poise.recipes.imitation import Imitation
 from refusals import refused
 
@@ -102,6 +112,48 @@ def test_an_opponent_out_of_reach_moves_as_if_it_were_alone(tracker: Tracker, ta
         torch.testing.assert_close(row, lone.backend.state.qpos[0], atol=1e-5, rtol=0)
     env.close()
     lone.close()
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_partner_walks_beside_the_character_hand_by_hand(tracker: Tracker, side: str) -> None:
+    task = imitation_of(tracker, [place(tracker.example, tracker)])
+    scene = HandInHand(side=side, partner="person")  # type: ignore[arg-type]
+    _, other = partner_stage(scene, tracker, task, scene.stage(task.humanoid, task.reference))
+    theirs = hand_of(task.humanoid, {"left": "right", "right": "left"}[side], "hands")
+    hand = hand_of(task.humanoid, side, "hands")
+    apart = other.reference.pose.pos[:, theirs] - task.reference.pose.pos[:, hand]
+    assert float(apart[0, :2].norm()) == pytest.approx(HANDS_APART_M, abs=0.1)
+    # Their arms swing alike, and they go the same way, though the walk turns a little.
+    assert float((apart.norm(dim=-1) - HANDS_APART_M).abs().max()) < 0.15
+    assert torch.allclose(other.reference.qpos[:, 2], task.reference.qpos[:, 2], atol=0.05)
+
+
+def test_two_people_hand_in_hand(tracker: Tracker) -> None:
+    task = imitation_of(tracker, [place(tracker.example, tracker)])
+    scene = HandInHand(partner="person")
+    stage, other = partner_stage(scene, tracker, task, scene.stage(task.humanoid, task.reference))
+    events = (*stage.events, opposing(other, tracker.policy, Compliance(), name="partner"))
+    own = replace(task.task, events=events, compliance=Compliance(), dones=())
+    env = replace(task, task=own, props=stage.props, links=stage.links).env(
+        1, threads=1, auto_reset=False, help_scale=0.0, guard=False
+    )
+    zero = torch.zeros(1, dtype=torch.long)
+    obs = env.reset_to(zero, zero)
+    for _ in range(30):
+        obs = env.step(tracker.policy.act(obs)).obs
+    sim = env.backend.sim  # type: ignore[attr-defined]
+    one, two = (sim.link(name).force[0] for name in ("hands", "theirs"))
+    # What pulls the one pulls the other back: what they hold between them weighs next to nothing.
+    assert float(one.norm()) > 1.0
+    assert float((one + two).norm()) < 0.2 * float(one.norm()) + 3.0
+    env.close()
+
+
+def test_two_people_do_not_look_ahead() -> None:
+    with refused("settings-conflict", says="two people"):
+        play(HandInHand(partner="person"), controller="lookahead")
+    with refused("settings-conflict", says="as fast as the character"):
+        HandInHand(partner="person", lead=0.5)
 
 
 def test_players_that_are_none() -> None:

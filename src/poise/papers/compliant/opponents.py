@@ -1,17 +1,21 @@
 """Other characters in the same worlds: opponents that act by policies of their own."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownVariableType=false, reportMissingTypeStubs=false
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
 from poise.env import Reference
 from poise.env.controls import steps
@@ -19,21 +23,23 @@ from poise.env.env import ImitationEnv
 from poise.env.events import EpisodeStart, Event, StatedEvent
 from poise.env.frame import Frame, Observable
 from poise.env.goal import Goal
-from poise.env.scene_events import InScene, touches_of
+from poise.env.scene_events import InScene, Switch, always, touches_of
 from poise.env.task import Acts, EnvStep
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.kinematics import Kinematics
+from poise.kinematics import Kinematics, qpos_to_clip
 from poise.machine import one_thread
-from poise.motion.rotations import heading_quat, lateral_heading
+from poise.motion.mirror import mirrored_clip
+from poise.motion.rotations import heading_quat, lateral_heading, quat_mul, quat_rotate, yaw_quat
 from poise.papers.compliant.motions import AT_SOMEBODY, hopping
-from poise.papers.compliant.scenes import Chicken, SceneSetup
-from poise.papers.compliant.scenes.body_scenes import RIVAL, weighing
+from poise.papers.compliant.scenes import Chicken, HandInHand, SceneSetup
+from poise.papers.compliant.scenes.body_scenes import CLASP, PARTNER, RIVAL, weighing
+from poise.papers.compliant.scenes.stage import hand_of
 from poise.recipes.imitation import Imitation
-from poise.sim import Backend, Character, CharacterRows, Drive, displaced
+from poise.sim import Backend, Character, CharacterRows, Drive, Link, displaced
 
 
 @dataclass(eq=False)
@@ -227,15 +233,71 @@ def rival_stage(scene: Chicken, tracker: Tracker, stage: SceneSetup) -> tuple[Sc
     return stage._replace(props=(rival,), touches=(*stage.touches, *felt)), task
 
 
+#: m, between both hands of two people; s, over which the way of the one follows that of the other.
+HANDS_APART_M, FOLLOWS_S = 0.14, 0.5
+
+
+def partner_stage(
+    scene: HandInHand, tracker: Tracker, task: Imitation, stage: SceneSetup
+) -> tuple[SceneSetup, Imitation]:
+    """The stage with a partner in it who does the task's motion in a mirror, on a way beside the
+    character's so that hand stays by hand; and the partner's task, whose event comes by `opposing`.
+
+    In a sharp turn the partner's feet slide, since it steps like one who turns the other way.
+
+    Raises:
+        PoiseError: the body has no hand on the other side, or its joints' names tell no sides.
+    """
+    body, mine = task.humanoid, task.reference
+    hand = hand_of(body, scene.side, "hands")
+    theirs = hand_of(body, "right" if scene.side == "left" else "left", "hands")
+    qpos = mine.qpos[: int(mine.length[0])].double().numpy()
+    clip = qpos_to_clip(qpos, body.table, body.skeleton, mine.rate_hz, name=task.library.names[0])
+    seen = mirrored_clip(clip).replaced(skeleton=clip.skeleton)
+    made = imitation_of(tracker, [place(seen, tracker)])
+    moved = made.reference.qpos.double().numpy().copy()
+    pos, other = (r.pose.pos.double().numpy() for r in (mine, made.reference))
+    even = partial(gaussian_filter1d, sigma=FOLLOWS_S * mine.rate_hz, axis=0, mode="nearest")
+    # How the partner is turned, so that it looks where the character does.
+    across = even(_across(body, pos))
+    turned = yaw_quat(even(np.unwrap(_angle(across) - _angle(_across(body, other)))))
+    moved[:, 3:7] = quat_mul(turned, moved[:, 3:7])
+    # Where its root is while hand is by hand: beside the character's, which sways to the other side.
+    out = across / np.linalg.norm(across, axis=1, keepdims=True)
+    arm = quat_rotate(turned, other[:, theirs] - other[:, 0])[:, :2]
+    aside = out if scene.side == "left" else -out
+    root, sways = pos[:, 0, :2], pos[:, 0, :2] - even(pos[:, 0, :2])
+    beside = even(pos[:, hand, :2] + HANDS_APART_M * aside - arm - root)
+    moved[:, :2] = root + beside - 2 * (sways * out).sum(1, keepdims=True) * out
+    reference = Reference(made.humanoid, [moved], mine.rate_hz, made.library.names)
+    link = Link("theirs", CLASP, f"{PARTNER}/{body.bodies[theirs]}", "ball", measured=True)
+    part = InScene(felt=(link.name,), events=(Switch(link.name, always),))
+    own = replace(made.task, events=(part,), dones=(), help_by="all")
+    partner = Character(made.humanoid, PARTNER)
+    stage = stage._replace(props=(*stage.props, partner), links=(*stage.links, link))
+    return stage, replace(made, reference=reference, task=own)
+
+
+def _across(body: Humanoid, pos: np.ndarray) -> np.ndarray:
+    """`(T, 2)` m, level, from the right thigh to the left one, of bodies' places `(T, B, 3)`."""
+    by = {body.table.rows[i].side: i for i in body.rows_of("thigh")}
+    return (pos[:, by["left"]] - pos[:, by["right"]])[:, :2]
+
+
+def _angle(way: np.ndarray) -> np.ndarray:
+    return np.arctan2(way[:, 1], way[:, 0])
+
+
 def opposing(
     task: Imitation,
     policy: Acts,
     given: Compliance | Stiffness | None,
     begin: Callable[[ImitationEnv], Any] | None = None,
+    name: str = RIVAL,
 ) -> Opponent:
-    """The opponent as an event, which gives way as the player does.
+    """The opponent, or partner, as an event, which gives way as the player does.
 
-    begin: is told the opponent's environment before the policy acts in it.
+    begin: is told the opponent's environment before the policy acts in it. name: of its character.
     """
     own = replace(task, task=replace(task.task, compliance=given))
 
@@ -245,7 +307,7 @@ def opposing(
             begin(env)
         return env
 
-    return Opponent(RIVAL, make, policy)
+    return Opponent(name, make, policy)
 
 
 class Undisplaced(NamedTuple):

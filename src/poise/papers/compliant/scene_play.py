@@ -32,9 +32,9 @@ from poise.jobs.track.controllers import look_ahead
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.papers.compliant.motions import motion_of
-from poise.papers.compliant.opponents import Opponent, opposing, rival_stage
+from poise.papers.compliant.opponents import Opponent, opposing, partner_stage, rival_stage
 from poise.papers.compliant.scene_training import LearnedOnTop, Topped, at_rate, seen, set_up
-from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene, SceneSetup
+from poise.papers.compliant.scenes import SCENES, Chicken, HandInHand, PlayScene, SceneSetup
 from poise.papers.compliant.scenes.stage import feels
 from poise.papers.compliant.watch import Watch, meter_of
 from poise.plan import LookaheadConfig
@@ -42,6 +42,7 @@ from poise.recipes.imitation import Imitation
 from poise.score import run_episodes, write_score
 from poise.score.report import Mover, write_report
 from poise.score.rollouts import RolloutSet
+from poise.sim import Character
 
 #: m/s^2; greatest force, in weights of a character, about which nothing is said.
 G, MOST_WEIGHTS = 9.81, 20.0
@@ -218,18 +219,19 @@ def play(
             it has learned to, or by the level that is given where it has learned several, and then acts
             in the twin, too.
         controller: the policy alone, or with lookahead, which simulates the scene with all that is going
-            to happen in it; not with what was learned on top, nor against an opponent.
+            to happen in it; not with what was learned on top, nor for two people.
         lookahead: how it looks ahead.
-        recover: get up after a fall and go on with the motion, which waits so long; an opponent stays
-            down.
-        rival: what was learned on top for the opponent; None is what the player has learned.
+        recover: get up after a fall and go on with the motion, which waits so long; an opponent or
+            partner stays down.
+        rival: what was learned on top for the opponent or partner; None is what the player has learned.
 
     Raises:
         PoiseError: the body cannot do the scene, the clip cannot be read, or the policy has not learned
             to get up.
     """
-    if controller == "lookahead" and (learned or getattr(scene, "against", "") == "rival"):
-        what = "against an opponent" if learned is None else "with what was learned on top"
+    two = getattr(scene, "against", "") == "rival" or getattr(scene, "partner", "") == "person"
+    if controller == "lookahead" and (learned or two):
+        what = "for two people" if learned is None else "with what was learned on top"
         raise PoiseError(
             f"lookahead does not act {what}",
             name or "play",
@@ -256,7 +258,9 @@ def play(
     opponent: Imitation | None = None
     if isinstance(scene, Chicken) and scene.against == "rival":
         stage, opponent = rival_stage(scene, tracker, stage)
-        task = replace(task, props=stage.props, touches=stage.touches)
+    elif isinstance(scene, HandInHand) and scene.partner == "person":
+        stage, opponent = partner_stage(scene, tracker, task, stage)
+    task = replace(task, props=stage.props, links=stage.links, touches=stage.touches)
     both: list[Looked] = []
     rival = rival or learned
     for known in (learned, rival):
@@ -266,7 +270,8 @@ def play(
     for compliance in (stage.yields(given), None):
         others: tuple[Opponent, ...] = ()
         if opponent is not None:
-            others = (_against(opponent, tracker, compliance, _acting(rival, compliance)),)
+            other = _against(opponent, tracker, compliance, _acting(rival, compliance), stage)
+            others = (other,)
         events = (*stage.events, *others)
         own = replace(task.task, events=events, compliance=compliance, help_by="all")
         top = _acting(learned, compliance)
@@ -290,14 +295,16 @@ def _against(
     tracker: Tracker,
     given: Compliance | Stiffness | None,
     learned: LearnedOnTop | None,
+    stage: SceneSetup,
 ) -> Opponent:
-    """The opponent, with what was learned on top of its policy, which sees what it feels."""
+    """The other one of a stage, with what was learned on top of its policy, which sees what it feels."""
+    (name,) = (p.name for p in stage.props if isinstance(p, Character))
     if learned is None:
-        return opposing(task, tracker.policy, given)
-    stage = SceneSetup(obs=(feels(task.humanoid),))
-    own = replace(task.task, obs=(*task.task.obs, *seen(stage, learned.config)))
+        return opposing(task, tracker.policy, given, name=name)
+    feeling = SceneSetup(obs=(feels(task.humanoid),))
+    own = replace(task.task, obs=(*task.task.obs, *seen(feeling, learned.config)))
     topped = Topped(tracker.policy, learned.top, learned.added)
-    return opposing(replace(task, task=own), topped, given, topped.begin)
+    return opposing(replace(task, task=own), topped, given, topped.begin, name)
 
 
 def _title(scene: str, motion: str) -> str:

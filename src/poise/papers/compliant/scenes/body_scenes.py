@@ -54,13 +54,15 @@ from poise.sim.props import Ball, Box, Carrier, Vector, solid
 
 @dataclass(frozen=True)
 class HandInHand:
-    """A partner's hand on a straight way beside the character, joined to its hand by a ball joint.
+    """A partner's hand beside the character, joined to its hand by a ball joint.
 
-    The partner is not simulated: its hand goes as fast as the motion goes on average, and `lead` faster,
-    and swings by `sway` along the way and up and down.
+    A hand that is carried goes straight, as fast as the motion goes on average and `lead` faster, and
+    swings by `sway` along the way and up and down. A partner who is a person does the same motion in a
+    mirror, gives way as the character does, and holds what weighs `CLASP_KG` between both hands.
 
     Attributes:
         side: of the character's hand.
+        partner: whether the hand is "carried", or is that of a "person".
         lead: m/s.
         sway: m, to either side.
         every_s: s, the time of a swing.
@@ -70,18 +72,33 @@ class HandInHand:
     starts: ClassVar[Spread] = LINKED
 
     side: Literal["left", "right"] = "left"
+    partner: Literal["carried", "person"] = "carried"
     lead: Annotated[float, Range(-10, 10, above=True, below=True, unit="m/s")] = 0.0
     sway: Annotated[float, Range(0, 1, below=True, unit="m")] = 0.1
     every_s: Annotated[float, Range(0.1, above=True, unit="s")] = 2.0
 
     def __post_init__(self) -> None:
         validate(self, "hands")
+        if self.partner == "person" and self.lead:
+            raise PoiseError(
+                "a partner who is a person goes as fast as the character",
+                "hands",
+                "Leave the lead out",
+                code="settings-conflict",
+            )
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> SceneSetup:
         """The partner's hand where the character's is at first, and the link; its force is felt."""
         row = hand_of(humanoid, self.side, "hands")
         frames, pose = int(reference.length[0]), reference.pose
         x, y, z = (float(v) for v in pose.pos[0, row])
+        learned = (feels(humanoid),), (eased(humanoid, HELD_SHARE),)
+        if self.partner == "person":
+            clasp = Ball(CLASP, 0.03, CLASP_KG, (x, y, z), touched=False)
+            link = Link("hands", CLASP, humanoid.bodies[row], "ball", measured=True)
+            begins = SetDown(CLASP, (x, y, z, 1.0, 0.0, 0.0, 0.0))
+            part = InScene(felt=("hands",), events=(begins, Switch("hands", always)))
+            return SceneSetup((clasp,), (link,), (), (part,), *learned, from_start=True)
         way = (pose.pos[frames - 1, 0, :2] - pose.pos[0, 0, :2]).double()
         speed = way * reference.rate_hz / max(1, frames - 1)
         size = float(speed.norm())
@@ -96,15 +113,7 @@ class HandInHand:
             events=(Move(name, self._path(velocity, ahead)), Switch("hands", always)),
         )
         link = Link("hands", name, body, "ball", measured=True)
-        return SceneSetup(
-            (prop,),
-            (link,),
-            (),
-            (part,),
-            (feels(humanoid),),
-            (eased(humanoid, HELD_SHARE),),
-            from_start=True,
-        )
+        return SceneSetup((prop,), (link,), (), (part,), *learned, from_start=True)
 
     def _path(self, velocity: Tensor, ahead: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
         w = 2.0 * math.pi / self.every_s
@@ -120,10 +129,12 @@ class HandInHand:
         return path
 
 
+#: What two people hold between them, and its kg.
+CLASP, CLASP_KG = "clasp", 0.1
 #: The usual force of each scene as a share of the character's weight, see `eased`.
 HELD_SHARE, THROWN_SHARE, BUMPED_SHARE, LANDED_SHARE = 0.1, 0.1, 0.5, 1.0
 #: What the other one is called in the scene.
-RIVAL = "rival"
+RIVAL, PARTNER = "rival", "partner"
 #: kg, of the paper's players.
 HEAVY_KG, LIGHT_KG = 85.0, 36.0
 
