@@ -33,7 +33,7 @@ from poise.papers.compliant.scenes import (
     door,
 )
 from poise.papers.compliant.scenes import body_scenes as trampoline
-from poise.papers.compliant.scenes.body_scenes import LiftedFoot
+from poise.papers.compliant.scenes.body_scenes import CATCHES_S, LiftedFoot
 from poise.papers.compliant.scenes.stage import small_forces
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Scene, SceneSim
@@ -116,22 +116,23 @@ def test_what_a_door_s_knob_does_and_what_the_task_pays(task: Imitation) -> None
 def test_a_hand_is_paid_for_the_arc_of_its_own_door(task: Imitation) -> None:
     (_, arc) = DoorScene(1.7, made_for=1.0).stage(task.humanoid, task.reference).rewards
     knob = arc.params["knob"]
-    # Half open, on the arc of this door and 0.1 m off; and while nothing is held.
+    # Half open, on the arc of this door, 0.1 m off and dragged onto it; and while nothing is held.
     half = 0.5 * door.OPENS
     middle = 0.5 * (door.GRIPS_S + 0.1 + door.LETS_GO_S - 0.3)
     x, y = float(knob[0]) - door.AHEAD_M, float(knob[1])
     held = [x * math.cos(half) + y * math.sin(half), y * math.cos(half) - x * math.sin(half), knob[2]]
-    pos = torch.tensor([held, held, held]) + torch.tensor([[0.0], [0.1], [9.0]])
+    pos = torch.tensor([held] * 4) + torch.tensor([[0.0], [0.1], [0.0], [9.0]])
+    load = torch.tensor([0.0, 0.0, door.ACROSS_N, 9.0])
 
     class Seen:
-        phase = torch.tensor([middle, middle, 0.5]) / door.LASTS_S
-        sim = SimpleNamespace(pos=pos.unsqueeze(1).expand(3, len(task.humanoid.bodies), 3))
+        phase = torch.tensor([middle, middle, middle, 0.5]) / door.LASTS_S
+        sim = SimpleNamespace(pos=pos.unsqueeze(1).expand(4, len(task.humanoid.bodies), 3))
 
         def source(self, name: str) -> Tensor:
-            return torch.zeros(3, 3)
+            return load if name == "load" else torch.zeros(4, 3)
 
     paid = arc.fn(Seen(), **arc.params)  # type: ignore[arg-type]
-    torch.testing.assert_close(paid, torch.tensor([1.0, math.exp(-0.3), 1.0]))
+    torch.testing.assert_close(paid, torch.tensor([1.0, math.exp(-0.3), math.exp(-1.0), 1.0]))
 
 
 def test_forces_are_to_stay_small_after_a_blow() -> None:
@@ -358,7 +359,12 @@ def test_a_foot_that_is_put_down_loses(task: Imitation) -> None:
     (end,) = Chicken().stage(task.humanoid, task.reference).dones
 
     class Seen:
-        phase = torch.tensor([0.0, 1.0, 1.0])
-        sim = SimpleNamespace(pos=torch.cat((pos, pos, up)), quat=quat.expand(3, -1, -1))
+        phase = torch.tensor([0.0, 1.0, 1.0, 1.0])
+        sim = SimpleNamespace(pos=torch.cat((pos, pos, up, pos)), quat=quat.expand(4, -1, -1))
 
-    assert end.fn(Seen(), **{**end.params, "share": 0.5}).tolist() == [False, True, False]  # type: ignore[arg-type]
+        def source(self, name: str) -> torch.Tensor:
+            return {"since": torch.tensor([9.0, 9.0, 9.0, CATCHES_S / 2])}[name]
+
+    ends = end.fn(Seen(), **{**end.params, "share": 0.5})  # type: ignore[arg-type]
+    # Not at first, not in the air, and not where the player catches itself after a blow.
+    assert ends.tolist() == [False, True, False, False]

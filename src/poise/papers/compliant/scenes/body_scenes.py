@@ -141,8 +141,9 @@ HEAVY_KG, LIGHT_KG = 85.0, 36.0
 
 #: s, how soft a punching bag is. A hard one wedges a player that has fallen under it.
 BAG_S = 0.1
-#: s into the motion from which on a player hops on one leg; m, a sole below that is on the floor.
-ONE_LEG_S, SOLE_M = 1.2, 0.01
+#: s into the motion from which on a player hops on one leg; m, a sole below that is on the floor; s after
+#: a touch in which a player that learns may catch itself with the other foot.
+ONE_LEG_S, SOLE_M, CATCHES_S = 1.2, 0.01, 1.0
 
 
 class LiftedFoot:
@@ -171,16 +172,17 @@ class LiftedFoot:
         return (pos[:, self.row, None] + arms)[..., 2].amin(1)
 
     def put_down(self, frame: Frame, share: float) -> Tensor:
-        """Whether it is on the floor after that share of the motion `(N,)`."""
+        """Whether it is on the floor after that share of the motion, though nothing touched the player
+        for `CATCHES_S` `(N,)`."""
         low = self.height(frame.sim.pos, frame.sim.quat) < SOLE_M
-        return low & (frame.phase > share)
+        return low & (frame.phase > share) & (frame.source("since") > CATCHES_S)
 
 
 @dataclass(frozen=True)
 class Chicken:
     """A player hops on one leg and bumps into what weighs as much as its opponent: a punching bag that
     comes at it from all around, as the paper trains it, or the opponent itself, hopping, too. Where it
-    learns, it loses once it puts the other foot down.
+    learns, it loses once it puts the other foot down, but not in the second after a blow.
 
     Masses scale inertia, gains and torques of the same body, so that each player alone moves alike.
 

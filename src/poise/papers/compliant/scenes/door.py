@@ -28,8 +28,8 @@ GRIPS_S, LETS_GO_S, LASTS_S, OPENS = 1.4, 4.2, 5.0, 0.8
 #: The angle that the task asks for, rad, and how fast the reward falls below it (Sec. 5.4).
 WANTED, SHARPNESS = 0.7, 1.5
 #: s after which the motion's door begins to open and before which it has, from grip and release on;
-#: 1/m^2, how fast the reward falls off the knob's arc.
-OPENING_S, ARC_SHARPNESS = (0.1, 0.3), 10.0
+#: 1/m^2, how fast the reward falls off the knob's arc; N, the usual force across it.
+OPENING_S, ARC_SHARPNESS, ACROSS_N = (0.1, 0.3), 10.0, 60.0
 #: Makes of a door that is drawn for each episode; where each one's knob is, as terms read it.
 MAKES, KNOB = 8, "door/knob"
 #: How near the hand must come to the knob, m.
@@ -164,10 +164,12 @@ def _knob(frame: Frame, knob: Tensor | None) -> Tensor:
 
 
 def on_arc(frame: Frame, row: int, knob: Tensor | None) -> Tensor:
-    """r = exp(-10 |p_hand - p|^2), p where the hand holds the knob of this door, turned about its hinge
-    by the angle at which the motion has its own one; 1 while the motion does not hold it.
+    """r = exp(-10 |p_hand - p|^2 - f / 60 N), p where the hand holds the knob of this door, turned about
+    its hinge by the angle at which the motion has its own one, f the force across the knob's way; 1 while
+    the motion does not hold it.
 
-    So a hand that follows the motion along the arc of another door is paid for the arc of this one.
+    So a hand that follows the motion along the arc of another door is paid for the arc of this one, and
+    for not being dragged onto it.
     """
     seconds = frame.phase * LASTS_S
     first, last = GRIPS_S + OPENING_S[0], LETS_GO_S - OPENING_S[1]
@@ -177,7 +179,7 @@ def on_arc(frame: Frame, row: int, knob: Tensor | None) -> Tensor:
     turn = torch.stack((half.cos(), nothing, nothing, -half.sin()), 1)
     held = _knob(frame, knob) - torch.tensor([AHEAD_M, 0.0, 0.0]).to(half)
     off = frame.source("door/pos") + quat_rotate(turn, held) - frame.sim.pos[:, row]
-    reward = torch.exp(-ARC_SHARPNESS * off.square().sum(-1))
+    reward = torch.exp(-ARC_SHARPNESS * off.square().sum(-1) - frame.source("load") / ACROSS_N)
     return torch.where((seconds > GRIPS_S) & (seconds < LETS_GO_S), reward, 1.0)
 
 
