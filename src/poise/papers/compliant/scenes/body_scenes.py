@@ -141,8 +141,8 @@ HEAVY_KG, LIGHT_KG = 85.0, 36.0
 
 #: s, how soft a punching bag is. A hard one wedges a player that has fallen under it.
 BAG_S = 0.1
-#: s into the motion from which on a player hops on one leg; m, a sole below that is on the floor; s after
-#: a touch in which a player that learns may catch itself with the other foot.
+#: s into the motion from which on a player hops on one leg; m, a sole below that is on the floor; s
+#: after a touch in which a player that learns may catch itself with the other foot.
 ONE_LEG_S, SOLE_M, CATCHES_S = 1.2, 0.01, 1.0
 
 

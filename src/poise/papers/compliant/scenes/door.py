@@ -165,8 +165,8 @@ def _knob(frame: Frame, knob: Tensor | None) -> Tensor:
 
 def on_arc(frame: Frame, row: int, knob: Tensor | None) -> Tensor:
     """r = exp(-10 |p_hand - p|^2 - f / 60 N), p where the hand holds the knob of this door, turned about
-    its hinge by the angle at which the motion has its own one, f the force across the knob's way; 1 while
-    the motion does not hold it.
+    its hinge by the angle at which the motion has its own one, f the force across the knob's way; 1
+    while the motion does not hold it.
 
     So a hand that follows the motion along the arc of another door is paid for the arc of this one, and
     for not being dragged onto it.
