@@ -18,6 +18,7 @@ FILES = {
     "generator": "generator.safetensors",
     "ball": "ball.safetensors",
     "chicken": "chicken.safetensors",
+    "door": "door.safetensors",
     "inbetween": "inbetween/model.safetensors",
 }
 

@@ -399,8 +399,10 @@ def tops(places: Places) -> dict[str, LearnedOnTop]:
 
 
 def fits(top: LearnedOnTop, unit: str) -> bool:
-    """Whether a case of the suite is of the scene that was learned, with the same players."""
+    """Whether a case of the suite is of the scene that was learned, with the same players or motion."""
     scene, own = SCENES[unit][0], top.config.play()
+    if isinstance(scene, DoorScene) and isinstance(own, DoorScene):
+        return (scene.made_for or scene.width) == (own.made_for or own.width)
     if isinstance(scene, Chicken) and isinstance(own, Chicken):
         return (scene.mass, scene.other) == (own.mass, own.other)
     return type(scene) is type(own)

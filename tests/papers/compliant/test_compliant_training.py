@@ -33,7 +33,7 @@ from poise.papers.compliant.scene_training import (
     shipped,
     train,
 )
-from poise.papers.compliant.scenes import Chicken
+from poise.papers.compliant.scenes import Chicken, DoorScene, Throws
 from poise.papers.compliant.scenes.ball import FictionalForces
 from poise.papers.compliant.scenes.body_scenes import Bounce
 from poise.papers.compliant.watch import part_of
@@ -129,11 +129,16 @@ def test_a_tiny_training_goes_on_and_is_played(tracker: Tracker, tmp_path: Path)
 
 def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
     learned = shipped("ball", tracker)
-    assert learned is not None and shipped("door", tracker) is None
+    assert learned is not None and shipped("throws", tracker) is None
     made = play(learned.config.play(), tracker, None, None, 2, 5.0, 1, "ball", learned)
     # A rod that nobody balances has fallen after 1.5 s.
     assert made.figures["stays_s"] > 4.9 and made.stiff["stays_s"] < 2.0 and made.figures["lost"] == 0
     assert shipped("ball", another(tracker)) is None
+    doors = shipped("door", tracker)
+    assert doors is not None
+    assert doors.config.suits(DoorScene(1.7)) == DoorScene(1.7, made_for=1.0)
+    assert doors.config.suits(DoorScene(1.7, made_for=1.7)) is None
+    assert doors.config.suits(DoorScene(2.0)) is None and doors.config.suits(Throws()) == Throws()
     hops = shipped("chicken", tracker)
     assert hops is not None and hops.config.drawn == (0.0, 0.2)
     assert all(file.stat().st_size < 500_000 for file in SHIPPED.values())

@@ -69,7 +69,7 @@ from poise.motion import Clip
 from poise.papers.compliant import imitation_controller as terms
 from poise.papers.compliant.motions import motion_of, standing
 from poise.papers.compliant.opponents import weighed
-from poise.papers.compliant.scenes import SCENES, Chicken, PlayScene, SceneSetup
+from poise.papers.compliant.scenes import SCENES, Chicken, DoorScene, PlayScene, SceneSetup
 from poise.papers.compliant.scenes.ball import FictionalForces
 from poise.papers.compliant.scenes.body_scenes import HEAVY_KG, LIGHT_KG
 from poise.papers.compliant.scenes.stage import Given, StartsOff
@@ -250,18 +250,19 @@ class Compliant:
     imitation_weight: float = 0.5
     task_weight: float = 0.5
     cooling: Share = 0.4
-    num_envs: int = 128
+    num_envs: int = 512
     seed: int = 0
     # The paper's networks. Its rate of 1e-5, its gamma of .95 and its noise of 6 degrees are not taken:
     # this learns in minutes, over 33 control steps, with a noise of .3 of what a force may add and less
-    # of what is added to a joint.
+    # of what is added to a joint. A critic that knows nothing yet would undo what stands already.
     ppo: PPOConfig = PPOConfig(
         policy_hidden=(256, 256, 256),
         value_hidden=(256, 256, 256),
         gamma=0.97,
         std=0.3,
-        policy_lr=3e-4,
-        minibatch=512,
+        policy_lr=1e-4,
+        minibatch=1024,
+        critic_warmup=4,
     )
 
     def __post_init__(self) -> None:
@@ -327,6 +328,15 @@ class Compliant:
             return None
         level = LEVELS if self.level is None and self.scene in EASED else self.level
         return level if isinstance(level, tuple) else None
+
+    def suits(self, scene: PlayScene) -> PlayScene | None:
+        """A scene as it was learned, None where it was not: of doors, their widths, by the motion for the
+        narrowest, which a door without a motion of its own gets."""
+        if not isinstance(scene, DoorScene):
+            return scene
+        low, high = _between(self.width)
+        motion = scene.made_for in (None, low) and low <= scene.width <= high
+        return replace(scene, made_for=low) if motion else None
 
     def given(self) -> Given | None:
         """How the character gives way while it learns; None is what suits the scene."""
@@ -429,9 +439,10 @@ RECIPE: dict[str, Any] = {"name": "compliant", "config": Compliant}
 
 #: What a run begins with.
 RUN_FILE = "compliant.json"
-#: What comes along on top of the policy that comes along, by scene.
+#: What comes along on top of the policy that comes along, by scene, see `Compliant.suits`.
 SHIPPED = {
-    scene: Path(__file__).parents[2] / "data" / f"{scene}.safetensors" for scene in ("ball", "chicken")
+    scene: Path(__file__).parents[2] / "data" / f"{scene}.safetensors"
+    for scene in ("ball", "chicken", "door")
 }
 
 
