@@ -330,8 +330,8 @@ class Compliant:
         return level if isinstance(level, tuple) else None
 
     def suits(self, scene: PlayScene) -> PlayScene | None:
-        """A scene as it was learned, None where it was not: of doors, their widths, by the motion for the
-        narrowest, which a door without a motion of its own gets."""
+        """A scene as it was learned, None where it was not: of doors, their widths, by the motion for
+        the narrowest, which a door without a motion of its own gets."""
         if not isinstance(scene, DoorScene):
             return scene
         low, high = _between(self.width)
