@@ -911,7 +911,8 @@ _FIGURE_5 = PaperTable(
 
 def _doors() -> tuple[Claim, ...]:
     out = list[Claim]()
-    for how in ("level 0.16", _LAG):
+    for how in ("level 0.16", _LAG, f"{_by('door')}, as learned"):
+        run = _LEARNED if how.startswith("learned") else f"{_SCENES} door"
         for width in ("1", "1.35", "1.7"):
             door = f"scenes:door {width} m, " + ("" if width == "1" else "motion for 1 m, ")
             across = ("across_n",)
@@ -923,12 +924,14 @@ def _doors() -> tuple[Claim, ...]:
                     f"{door}without",
                     "without compliance",
                     judged=across,
+                    run=run,
                 )
             )
             if width != "1":
                 first = f"scenes:door 1 m, {how}"
                 wide = f"{width} m wide, {how}"
-                out.append(Claim(wide, f"{door}{how}", "alike", first, "1 m wide", judged=across))
+                like = Claim(wide, f"{door}{how}", "alike", first, "1 m wide", judged=across, run=run)
+                out.append(like)
     return tuple(out)
 
 
