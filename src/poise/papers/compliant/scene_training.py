@@ -102,7 +102,7 @@ class Added:
         if self.forces:
             forces = env.event(FictionalForces)
             assert forces is not None
-            forces.asked = own[:, joints:].clone()
+            own = torch.where(forces.ask(own[:, joints:]), own, 0.0)
         if not joints:
             return below
         out = below.clone()

@@ -243,10 +243,7 @@ class FictionalForces(StatedEvent[Goal, Backend], Force):
     def before_step(self, drive: Drive) -> bool:
         """A control step begins: sets the forces that are held for it."""
         law = self.law
-        off, moves = tipped(self._sim, self._length)
-        off = off - self._head()
-        # A ball that has fallen is let go.
-        up = (off[:, 2:] > 0.5 * self._length).to(off)
+        off, moves, up = self._ball()
         one = up * FLAT.to(off) * (law.gain * off + law.damping * moves)
         force = torch.stack((one, one), 1).to(self._force)
         if self.asked is not None:
@@ -256,6 +253,20 @@ class FictionalForces(StatedEvent[Goal, Backend], Force):
         size = force.norm(dim=-1, keepdim=True)
         self._force = force * (MOST_N / size.clamp_min(MOST_N))
         return False
+
+    def ask(self, forces: Tensor) -> Tensor:
+        """Asks for forces `(N, 6)`, see `asked`, where the ball is up: one that has fallen is let go.
+        Whether it is, `(N, 1)`."""
+        _, _, up = self._ball()
+        self.asked = (up * forces).to(forces)
+        return up.bool()
+
+    def _ball(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Where the ball is against where the head would be, `(N, 3)` m, its velocity, and 1 where it is
+        up `(N, 1)`."""
+        off, moves = tipped(self._sim, self._length)
+        off = off - self._head()
+        return off, moves, (off[:, 2:] > 0.5 * self._length).to(off)
 
     def _head(self) -> Tensor:
         """`(N, 3)` where the head would be without giving way, m."""
