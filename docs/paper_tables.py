@@ -842,7 +842,7 @@ _HOPS = PaperTable(
         Claim("level 0.16", "scenes:chicken, hopping alone for 17 s, level 0.16"),
         Claim(
             "level 0.16, trained for the scene",
-            f"scenes:chicken, hopping alone for 17 s, {_by('chicken')}, level 0.16",
+            f"scenes:chicken, hopping alone for 17 s, {_by('hops')}, level 0.16",
             "better",
             "scenes:chicken, hopping alone for 17 s, level 0.16",
             "not trained",

@@ -403,6 +403,8 @@ def fits(top: LearnedOnTop, unit: str) -> bool:
     scene, own = SCENES[unit][0], top.config.play()
     if isinstance(scene, DoorScene) and isinstance(own, DoorScene):
         return (scene.made_for or scene.width) == (own.made_for or own.width)
+    if top.config.suits(scene) is None:
+        return False
     if isinstance(scene, Chicken) and isinstance(own, Chicken):
         return (scene.mass, scene.other) == (own.mass, own.other)
     return type(scene) is type(own)

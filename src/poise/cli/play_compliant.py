@@ -129,7 +129,7 @@ def run(
     from poise.jobs.open import open_run
     from poise.jobs.track.pushed import way_of
     from poise.papers.compliant.scene_play import play
-    from poise.papers.compliant.scene_training import open_learned, shipped
+    from poise.papers.compliant.scene_training import along, open_learned
 
     how = lookahead_of(budget)
     stated: dict[str, Any] = {
@@ -176,12 +176,11 @@ def run(
         tracker = open_run(policy).tracker
         chosen = level is not None or newtons_per_metre is not None
         if learned is None:
-            knows = None if controller == "lookahead" else shipped(scene, tracker)
+            knows = None if controller == "lookahead" else along(place, tracker)
             # A policy that comes along is asked for nothing that it has not learned.
             drawn = knows is not None and knows.config.drawn is not None
             knows = None if (newtons_per_metre is not None if drawn else chosen) else knows
-            suited = None if knows is None else knows.config.suits(place)
-            place, knows = (place, None) if suited is None else (suited, knows)
+            place = place if knows is None else knows.config.suits(place) or place
         else:
             knows = None if str(learned) == "none" else open_learned(learned, tracker)
             if knows is not None and knows.config.policy and policy is None:

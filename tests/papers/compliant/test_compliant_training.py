@@ -26,6 +26,7 @@ from poise.papers.compliant.scene_training import (
     Added,
     Compliant,
     OnTop,
+    along,
     config_of,
     open_learned,
     save_learned,
@@ -139,6 +140,10 @@ def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
     assert doors.config.suits(DoorScene(1.7)) == DoorScene(1.7, made_for=1.0)
     assert doors.config.suits(DoorScene(1.7, made_for=1.7)) is None
     assert doors.config.suits(DoorScene(2.0)) is None and doors.config.suits(Throws()) == Throws()
+    assert along(DoorScene(2.0), tracker) is None and along(Throws(), tracker) is None
+    for against in ("nobody", "bag", "rival"):
+        top = along(Chicken(against=against), tracker)
+        assert top is not None and (top.config.against == "nobody") == (against == "nobody")
     hops = shipped("chicken", tracker)
     assert hops is not None and hops.config.drawn == (0.0, 0.2)
     assert all(file.stat().st_size < 500_000 for file in SHIPPED.values())

@@ -32,7 +32,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -209,6 +209,7 @@ class Compliant:
         tilt: rad, by how much the rod is tilted at first, at random.
         height: m, by which the trampoline rises for a bounce.
         players: kg, of the chicken fight's player and of its opponent, in whose place a bag comes.
+        against: whether that "bag" comes, or "nobody": the player hops alone.
         pushes: N, of pushes at the chest while the ball is balanced.
         spread: how many times the scene's own spread episodes begin off the motion.
         seconds: s, how long episodes last where the scene's motion has no end of its own.
@@ -238,6 +239,7 @@ class Compliant:
     tilt: Annotated[float, Range(0, 1, below=True, unit="rad")] = 0.1
     height: Annotated[Drawn, Range(0, 1, rising=True, unit="m")] = (0.05, 0.2)
     players: Annotated[tuple[float, float], Range(2, 500, unit="kg")] = (HEAVY_KG, LIGHT_KG)
+    against: Literal["bag", "nobody"] = "bag"
     pushes: float = 0.0
     spread: Annotated[float, Range(0, 10)] = 1.0
     seconds: Annotated[float, Range(0.5, 600, unit="s")] = 6.0
@@ -315,7 +317,7 @@ class Compliant:
                 "arc": self.arc,
                 **({"widths": width, "made_for": width[0]} if width[0] < width[1] else {}),
             },
-            "chicken": {"mass": own, "other": weight, "seed": self.seed},
+            "chicken": {"mass": own, "other": weight, "against": self.against, "seed": self.seed},
             "throws": {"seed": self.seed},
             "trampoline": {"heights": _between(self.height)},
         }
@@ -330,8 +332,10 @@ class Compliant:
         return level if isinstance(level, tuple) else None
 
     def suits(self, scene: PlayScene) -> PlayScene | None:
-        """A scene as it was learned, None where it was not: of doors, their widths, by the motion for
-        the narrowest, which a door without a motion of its own gets."""
+        """A scene as it was learned, None where it was not: hopping alone or not, and of doors their
+        widths, by the motion for the narrowest, which a door without a motion of its own gets."""
+        if isinstance(scene, Chicken):
+            return scene if (scene.against == "nobody") == (self.against == "nobody") else None
         if not isinstance(scene, DoorScene):
             return scene
         low, high = _between(self.width)
@@ -418,6 +422,7 @@ def task(base: TaskConfig, stage: SceneSetup, config: Compliant, rate_hz: float)
 #: The settings of earlier versions' runs, which do not name them.
 _MIGRATION = Migration(
     absent={
+        "against": "bag",
         "arc": 0.0,
         "length": 1.0,
         "mass": 0.5,
@@ -439,10 +444,10 @@ RECIPE: dict[str, Any] = {"name": "compliant", "config": Compliant}
 
 #: What a run begins with.
 RUN_FILE = "compliant.json"
-#: What comes along on top of the policy that comes along, by scene, see `Compliant.suits`.
+#: What comes along on top of the policy that comes along, by its name.
 SHIPPED = {
-    scene: Path(__file__).parents[2] / "data" / f"{scene}.safetensors"
-    for scene in ("ball", "chicken", "door")
+    name: Path(__file__).parents[2] / "data" / f"{name}.safetensors"
+    for name in ("ball", "chicken", "door", "hops")
 }
 
 
@@ -609,12 +614,23 @@ def digest_of(policy: PolicyBundle) -> str:
     return told.hexdigest()[:16]
 
 
-def shipped(scene: str, tracker: Tracker) -> LearnedOnTop | None:
-    """What comes along for a scene; None where there is nothing, or it belongs to another policy."""
-    path = SHIPPED.get(scene)
+def shipped(name: str, tracker: Tracker) -> LearnedOnTop | None:
+    """What comes along by that name; None where there is nothing, or it belongs to another policy."""
+    path = SHIPPED.get(name)
     if path is None or load_checkpoint(path)[1]["metadata"]["below"] != digest_of(tracker.policy):
         return None
     return open_learned(path, tracker)
+
+
+def along(scene: PlayScene, tracker: Tracker) -> LearnedOnTop | None:
+    """What comes along for a scene as it is; None where nothing has learned it."""
+    for name in SHIPPED:
+        top = shipped(name, tracker)
+        if top is None or not isinstance(scene, SCENES[top.config.scene]):
+            continue
+        if top.config.suits(scene) is not None:
+            return top
+    return None
 
 
 def open_learned(folder: Path, tracker: Tracker) -> LearnedOnTop:
