@@ -772,6 +772,9 @@ _HANDS = PaperTable(
 _FIGHT = "scenes:chicken, heavy and light, "
 
 
+_FOUGHT = f"heavy and light, {_by('chicken')}"
+
+
 def _light(name: str, than: str, beside: str, metric: str) -> Claim:
     """How far the light player is pushed."""
     ours = f"{_FIGHT}level 0.16"
@@ -817,7 +820,7 @@ _CHICKEN = PaperTable(
                 "the light one, both trained",
                 f"{_FIGHT}{_by('chicken')}, level 0.16",
                 "better",
-                f"{_FIGHT}{_by('chicken')}, {than}",
+                f"scenes:chicken, {than}",
                 beside,
                 metric="rival_pushed_mm",
                 than_metric=metric,
@@ -825,8 +828,14 @@ _CHICKEN = PaperTable(
                 run=_LEARNED,
             )
             for than, beside, metric in (
-                ("level 0.16", "the heavy one", "pushed_mm"),
-                ("without", "the light one without compliance", "rival_pushed_mm"),
+                (f"{_FOUGHT}, level 0.16", "the heavy one", "pushed_mm"),
+                (f"{_FOUGHT}, without", "the light one without compliance", "rival_pushed_mm"),
+                (
+                    f"60 kg each, {_by('chicken')}, level 0.16",
+                    "one of equal masses, trained",
+                    "rival_pushed_mm",
+                ),
+                (f"{_FOUGHT}, nobody touches", "one whom nobody touches, trained", "pushed_mm"),
             )
         ),
     ),

@@ -348,8 +348,9 @@ def played(places: Places, unit: str, top: LearnedOnTop | None = None) -> Any:
         how = {} if not seconds else {"seconds": seconds}
         made = play(scene, tracker, clip, WAY.get(way), many, threads=1, learned=own, rival=rival, **how)
         out["without"], out[way] = told(made.stiff_episodes), told(made.episodes)
-    if top is None and unit != HOPS and not isinstance(scene, Balance):
-        out["nobody touches"] = nobody(tracker, scene, clip, made, many, seconds)
+    alone = unit != HOPS and (isinstance(scene, Chicken) or top is None)
+    if alone and not isinstance(scene, Balance):
+        out["nobody touches"] = nobody(tracker, scene, clip, made, many, seconds, top)
     return out
 
 
@@ -405,7 +406,7 @@ def fits(top: LearnedOnTop, unit: str) -> bool:
         return (scene.made_for or scene.width) == (own.made_for or own.width)
     if top.config.suits(scene) is None:
         return False
-    if isinstance(scene, Chicken) and isinstance(own, Chicken):
+    if isinstance(scene, Chicken) and isinstance(own, Chicken) and scene.against == "bag":
         return (scene.mass, scene.other) == (own.mass, own.other)
     return type(scene) is type(own)
 
@@ -468,14 +469,21 @@ def interval(values: list[float], name: str) -> str:
 
 
 def nobody(
-    tracker: Tracker, scene: PlayScene, clip: Clip | None, made: Played, many: int, seconds: float
+    tracker: Tracker,
+    scene: PlayScene,
+    clip: Clip | None,
+    made: Played,
+    many: int,
+    seconds: float,
+    top: LearnedOnTop | None = None,
 ) -> dict[str, list[float | None]]:
     """The same motion from the same starts on a floor where nobody comes: steps, losses, distance,
     torque. Of a fight also how far the pelvis leaves its way in the half second of the first touch."""
     own = motion_of(scene, tracker, seconds) or clip
     free = Throws(every_s=(100.0, 100.0))
-    alone = play(free, tracker, own, None, many, seconds or own.seconds if own else seconds, 1)
-    every = told(alone.stiff_episodes)
+    seconds = seconds or own.seconds if own else seconds
+    alone = play(free, tracker, own, None, many, seconds, 1, learned=top)
+    every = told(alone.stiff_episodes if top is None else alone.episodes)
     out = {k: every[k] for k in ("steps", "lost", "off_m", "torque_nm")}
     if isinstance(scene, Chicken):
         rolled = alone.evaluation.rollouts
