@@ -180,7 +180,6 @@ def run(
             # A policy that comes along is asked for nothing that it has not learned.
             drawn = knows is not None and knows.config.drawn is not None
             knows = None if (newtons_per_metre is not None if drawn else chosen) else knows
-            place = place if knows is None else knows.config.suits(place) or place
         else:
             knows = None if str(learned) == "none" else open_learned(learned, tracker)
             if knows is not None and knows.config.policy and policy is None:
@@ -191,7 +190,7 @@ def run(
             what, learned, f"Write poise play compliant {knows.config.scene}", code="scene-differs"
         )
     if knows is not None:
-        given = knows.config.played(given)
+        given, place = knows.config.played(given), knows.config.suits(place) or place
     with claimed(out):
         with working("simulating"):
             more = (count, duration, threads, scene, knows, controller, how, recover)
