@@ -19,6 +19,7 @@ FILES = {
     "ball": "ball.safetensors",
     "chicken": "chicken.safetensors",
     "door": "door.safetensors",
+    "hands": "hands.safetensors",
     "hops": "hops.safetensors",
     "inbetween": "inbetween/model.safetensors",
 }

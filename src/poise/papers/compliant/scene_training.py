@@ -447,7 +447,7 @@ RUN_FILE = "compliant.json"
 #: What comes along on top of the policy that comes along, by its name.
 SHIPPED = {
     name: Path(__file__).parents[2] / "data" / f"{name}.safetensors"
-    for name in ("ball", "chicken", "door", "hops")
+    for name in ("ball", "chicken", "door", "hands", "hops")
 }
 
 
