@@ -596,11 +596,13 @@ def train(
 
 
 def save_learned(learned: LearnedOnTop, tracker: Tracker, path: Path) -> None:
-    """Writes what was learned on top of a policy as one file, its matrices in half precision."""
+    """Writes what was learned on top of a policy as one file, its matrices in half precision, its clip by
+    the file's name alone."""
+    config = replace(learned.config, clip=Path(learned.config.clip).name)
     meta = {
         "kind": "policy", **learned.top.identity(tracker.humanoid.identity),
         "metadata": {
-            "recipe": "compliant", "config": to_data(learned.config), "below": digest_of(tracker.policy)
+            "recipe": "compliant", "config": to_data(config), "below": digest_of(tracker.policy)
         },
     }  # fmt: skip
     save_checkpoint(path, {k: halved(k, v) for k, v in learned.top.state().items()}, meta)
