@@ -108,8 +108,8 @@ def run(
         pushes: ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0).
         seed: throws, ball, chicken: of the draws (0).
         learned: what was learned on top of the policy: the folder of poise train compliant SCENE, at
-            --level where it learned levels; in a fight for both. For ball, chicken and door something
-            comes along; none goes without.
+            --level where it learned levels; for two people for both. For ball, chicken, door and hands
+            something comes along; none goes without.
             pull, hands: also that of poise train compliant-imitation, which stands by itself.
         recover: get up after a fall and go on; an opponent stays down.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the
