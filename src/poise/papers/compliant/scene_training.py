@@ -596,8 +596,8 @@ def train(
 
 
 def save_learned(learned: LearnedOnTop, tracker: Tracker, path: Path) -> None:
-    """Writes what was learned on top of a policy as one file, its matrices in half precision, its clip by
-    the file's name alone."""
+    """Writes what was learned on top of a policy as one file, its matrices in half precision, its clip
+    by the file's name alone."""
     config = replace(learned.config, clip=Path(learned.config.clip).name)
     meta = {
         "kind": "policy", **learned.top.identity(tracker.humanoid.identity),
