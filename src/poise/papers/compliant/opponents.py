@@ -246,7 +246,8 @@ def partner_stage(
     In a sharp turn the partner's feet slide, since it steps like one who turns the other way.
 
     Raises:
-        PoiseError: the body has no hand on the other side, or its joints' names tell no sides.
+        PoiseError: the body has no hand on the other side or no two thighs, or its joints' names tell no
+            sides.
     """
     body, mine = task.humanoid, task.reference
     hand = hand_of(body, scene.side, "hands")
@@ -281,6 +282,12 @@ def partner_stage(
 def _across(body: Humanoid, pos: np.ndarray) -> np.ndarray:
     """`(T, 2)` m, level, from the right thigh to the left one, of bodies' places `(T, B, 3)`."""
     by = {body.table.rows[i].side: i for i in body.rows_of("thigh")}
+    if not {"left", "right"} <= by.keys():
+        raise PoiseError(
+            "the skeleton has no two thighs, by which two people look the same way",
+            hint=f"Its bodies are {', '.join(body.bodies)}",
+            code="body-part-missing",
+        )
     return (pos[:, by["left"]] - pos[:, by["right"]])[:, :2]
 
 
