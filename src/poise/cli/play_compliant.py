@@ -100,16 +100,16 @@ def run(
         against: chicken: a punching bag as heavy as the opponent (default), the opponent itself, or
             nobody.
         width: door: how wide (1).
-        made_for: door: how wide the door is for which the motion is made; by default the 1 m of what was
-            learned, up to 1.7 m, and without that the door's own width.
+        made_for: door: how wide the door is for which the motion is made; by default 1 m for doors
+            of 1 to 1.7 m, as the policy for doors has learned it, else the door's own width.
         height: trampoline: how far its actuators rise for a bounce (0.15).
         first: trampoline: when the first bounce begins (1).
         length: ball: of the rod (1).
         pushes: ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0).
         seed: throws, ball, chicken: of the draws (0).
         learned: what was learned on top of the policy: the folder of poise train compliant SCENE, at
-            --level where it learned levels; for two people for both. For ball, chicken, door and hands
-            something comes along; none goes without.
+            --level where it learned levels; of two people for both. For ball, chicken, door and hands
+            a policy comes along; none goes without.
             pull, hands: also that of poise train compliant-imitation, which stands by itself.
         recover: get up after a fall and go on; an opponent stays down.
         controller: the policy alone, or with lookahead, which tries what it may do in copies of the

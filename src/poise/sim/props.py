@@ -36,14 +36,24 @@ class Prop(Protocol):
 
 
 def solid(
-    body: mujoco.MjsBody, name: str, kind: str, size: Sequence[float], **more: Any
+    body: mujoco.MjsBody,
+    name: str,
+    kind: str,
+    size: Sequence[float],
+    touched: bool = True,
+    **more: Any,
 ) -> mujoco.MjsGeom:
-    """Adds a geom with the friction of props: "box", "sphere", "capsule", "cylinder" or "mesh"."""
+    """Adds a geom with the friction of props: "box", "sphere", "capsule", "cylinder" or "mesh".
+
+    touched: whether anything touches it.
+    """
     geom = body.add_geom(
         name=name, type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), condim=3, **more
     )
     geom.size = [*size, *[0.0] * (3 - len(size))]
     geom.friction = list(FRICTION)
+    if not touched:
+        geom.contype = geom.conaffinity = 0
     return geom
 
 
@@ -115,9 +125,7 @@ class Carrier(Checked):
             body.add_joint(name=f"{self.name}/{axis}", type=slide, axis=list(along))
         hinge = mujoco.mjtJoint.mjJNT_HINGE
         body.add_joint(name=f"{self.name}/turn", type=hinge, axis=[0, 0, 1])
-        geom = solid(body, self.name, "box", [s / 2 for s in self.size], mass=MASS)
-        if not self.touched:
-            geom.contype = geom.conaffinity = 0
+        solid(body, self.name, "box", [s / 2 for s in self.size], self.touched, mass=MASS)
         # The floor would hold it back.
         spec.add_exclude(bodyname1="world", bodyname2=self.name)
 
@@ -315,6 +323,4 @@ class Ball(Checked):
         """Adds one body."""
         body = spec.worldbody.add_body(name=self.name, pos=list(self.pos))
         body.add_freejoint(name=self.name)
-        geom = solid(body, self.name, "sphere", [self.radius], mass=self.mass)
-        if not self.touched:
-            geom.contype = geom.conaffinity = 0
+        solid(body, self.name, "sphere", [self.radius], self.touched, mass=self.mass)

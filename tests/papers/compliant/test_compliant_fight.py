@@ -143,7 +143,7 @@ def test_two_people_hand_in_hand(tracker: Tracker) -> None:
         obs = env.step(tracker.policy.act(obs)).obs
     sim = env.backend.sim  # type: ignore[attr-defined]
     one, two = (sim.link(name).force[0] for name in ("hands", "theirs"))
-    # What pulls the one pulls the other back: what they hold between them weighs next to nothing.
+    # Each pulls the other back: the thing between them weighs next to nothing.
     assert float(one.norm()) > 1.0
     assert float((one + two).norm()) < 0.2 * float(one.norm()) + 3.0
     env.close()

@@ -75,12 +75,8 @@ class Rod(Checked):
         body.add_freejoint(name=self.name)
         rod, ball = [0.0, 0.0, self.length / 2], [0.0, 0.0, self.length]
         thin = [0.015, self.length / 2]
-        geoms = (
-            solid(body, f"{self.name}/rod", "capsule", thin, pos=rod, mass=0.1 * self.mass),
-            solid(body, f"{self.name}/ball", "sphere", [self.radius], pos=ball, mass=self.mass),
-        )
-        for geom in geoms:
-            geom.contype = geom.conaffinity = 0
+        solid(body, f"{self.name}/rod", "capsule", thin, False, pos=rod, mass=0.1 * self.mass)
+        solid(body, f"{self.name}/ball", "sphere", [self.radius], False, pos=ball, mass=self.mass)
 
 
 @dataclass(frozen=True)

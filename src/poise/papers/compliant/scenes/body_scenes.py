@@ -129,7 +129,7 @@ class HandInHand:
         return path
 
 
-#: What two people hold between them, and its kg.
+#: The thing that two people hold between them, and its kg.
 CLASP, CLASP_KG = "clasp", 0.1
 #: The usual force of each scene as a share of the character's weight, see `eased`.
 HELD_SHARE, THROWN_SHARE, BUMPED_SHARE, LANDED_SHARE = 0.1, 0.1, 0.5, 1.0
